@@ -1,0 +1,1 @@
+"""Two agents, one body: actors, critics, losses, the learner and its runner."""

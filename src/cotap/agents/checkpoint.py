@@ -1,0 +1,100 @@
+"""Checkpoint files: plain tensors and numbers, written whole or not at all, loaded without running code."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import pickle
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+FORMAT = "cotap-checkpoint"
+VERSION = 1
+
+
+class CheckpointError(ValueError):
+    """A file that cannot be used as a checkpoint; the message names it and says why."""
+
+
+def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
+    """Let `write` fill a temporary file beside `path`, then rename it: readers see the old file or the new, whole.
+
+    Raises:
+        OSError: the disk is full or the folder not writable; nothing is left behind, and an old file is untouched.
+    """
+    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        write(temporary)
+        with temporary.open("rb") as f:
+            os.fsync(f.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        raise
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write `value` as strict JSON (non-finite numbers are refused), atomically."""
+    text = json.dumps(value, indent=2, allow_nan=False) + "\n"
+    write_atomically(path, lambda p: p.write_text(text, encoding="utf-8"))
+
+
+def save_checkpoint(path: Path, content: dict[str, Any]) -> None:
+    """Save `content`, which holds nothing but tensors, numbers, strings, lists and dicts.
+
+    Raises:
+        OSError: it cannot be written; an older file of that name is untouched.
+    """
+    payload = {"format": FORMAT, "version": VERSION, **content}
+
+    def write(temporary: Path) -> None:
+        try:
+            torch.save(payload, temporary)
+        except RuntimeError as error:  # torch reports a full disk this way
+            raise OSError(f"cannot write checkpoint {path}: {error}") from error
+
+    write_atomically(path, write)
+
+
+def load_checkpoint(path: Path | str, device: str = "cpu") -> dict[str, Any]:
+    """Load a checkpoint without running any code from the file.
+
+    Raises:
+        CheckpointError: the file is missing, truncated, foreign, or of another version.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise CheckpointError(f"checkpoint {str(path)!r} does not exist")
+    try:
+        content = torch.load(path, map_location=device, weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError, KeyError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise CheckpointError(f"checkpoint {str(path)!r} cannot be read (truncated or foreign): {reason}") from error
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise CheckpointError(f"{str(path)!r} is not a cotap checkpoint")
+    if content.get("version") != VERSION:
+        raise CheckpointError(f"{str(path)!r} has version {content.get('version')!r}; this cotap reads {VERSION}")
+    return content
+
+
+def require_layout(path: Path | str, saved: dict[str, Any], present: dict[str, Any]) -> None:
+    """Raise CheckpointError naming the first entry in which a checkpoint's layout differs from the environment's."""
+    for key, value in present.items():
+        if saved.get(key) != value:
+            raise CheckpointError(
+                f"checkpoint {str(path)!r} was trained with another {key}: {saved.get(key)!r}, here {value!r}"
+            )
+
+
+def sha256(path: Path | str) -> str:
+    """Hex digest of a file."""
+    return hashlib.sha256(Path(path).read_bytes()).hexdigest()

@@ -1,0 +1,245 @@
+"""Two agents, each a clipped-surrogate PPO on its own reward group (FALCON's scheme)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import nn
+
+from cotap.agents.actors import AgentLayout, DualActorCritic, Observations
+from cotap.agents.losses import (
+    adapt_learning_rate,
+    clipped_surrogate,
+    clipped_value_loss,
+    gaussian_entropy,
+    gaussian_kl,
+    gaussian_log_prob,
+    generalized_advantages,
+)
+from cotap.agents.precision import resolve_precision
+from cotap.checks import require_positive_int, require_range
+
+
+@dataclass
+class DualPPOConfig:
+    """Hyperparameters, the same for both agents."""
+
+    hidden: tuple[int, ...] = (256, 128, 64)
+    """Hidden layers of every actor and critic."""
+    initial_std: float = 0.6
+    """Standard deviation of actions at the start."""
+    steps: int = 24
+    """Steps per world and iteration."""
+    epochs: int = 3
+    """Passes over a rollout."""
+    mini_batches: int = 4
+    """Parts that each pass is cut into."""
+    gamma: float = 0.99
+    """Discount."""
+    lam: float = 0.95
+    """Trace decay of the advantage estimates."""
+    clip: float = 0.2
+    """Clip range of the surrogate and of values."""
+    entropy: float = 0.003
+    """Weight of the entropy bonus."""
+    value: float = 1.0
+    """Weight of the value loss."""
+    learning_rate: float = 1e-3
+    """At the start; then adapted to `desired_kl`, per agent."""
+    desired_kl: float = 0.01
+    """Change of the policy per update that the learning rate aims at [nat]."""
+    max_grad_norm: float = 1.0
+    """Gradient norm above which gradients are scaled down, per network."""
+    precision: str = "auto"
+    """auto, bf16 or fp32."""
+    normalizer_stride: int = 4
+    """Observations of every so many steps update the normalisers."""
+
+    def check(self) -> None:
+        """Raise ValueError naming the first field that is out of its range."""
+        for name in ("steps", "epochs", "mini_batches", "normalizer_stride"):
+            require_positive_int(f"ppo.{name}", getattr(self, name))
+        if not self.hidden:
+            raise ValueError("ppo.hidden must name at least one layer, got ()")
+        for i, width in enumerate(self.hidden):
+            require_positive_int(f"ppo.hidden[{i}]", width)
+        require_range("ppo.gamma", self.gamma, 0.0, 1.0)
+        require_range("ppo.lam", self.lam, 0.0, 1.0)
+        for name in ("initial_std", "clip", "learning_rate", "desired_kl", "max_grad_norm"):
+            require_range(f"ppo.{name}", getattr(self, name), 1e-8, 1e3)
+        for name in ("entropy", "value"):
+            require_range(f"ppo.{name}", getattr(self, name), 0.0, 1e3)
+
+
+@dataclass
+class Rollout:
+    """What one iteration collects: T steps, N worlds, G agents. Observations are stored normalised."""
+
+    observations: Observations
+    actions: torch.Tensor
+    means: torch.Tensor
+    log_probs: torch.Tensor
+    values: torch.Tensor
+    rewards: torch.Tensor
+    dones: torch.Tensor
+    advantages: torch.Tensor = field(init=False)
+    returns: torch.Tensor = field(init=False)
+
+
+class DualPPO:
+    """Collects with the joint policy, learns with each agent's own reward.
+
+    Args:
+        layout: Sizes, slices and groups, from the environment.
+        num_envs: Number of worlds.
+        cfg: Hyperparameters.
+        device: Where the networks live.
+    """
+
+    def __init__(self, layout: AgentLayout, num_envs: int, cfg: DualPPOConfig, device: str = "cpu") -> None:
+        cfg.check()
+        self.cfg, self.device, self.layout = cfg, device, layout
+        self.dtype = resolve_precision(cfg.precision, device)
+        self.names = tuple(layout.action_slices)
+        self.model = DualActorCritic(layout, cfg.hidden, cfg.initial_std).to(device)
+        self.learning_rates = dict.fromkeys(self.names, cfg.learning_rate)
+        self.optimizers = {
+            name: torch.optim.Adam(
+                [
+                    *self.model.actors[name].parameters(),
+                    self.model.log_std[name],
+                    *self.model.critics[name].parameters(),
+                ],
+                lr=cfg.learning_rate,
+                fused=True,
+            )
+            for name in self.names
+        }
+        if num_envs * cfg.steps < cfg.mini_batches:
+            raise ValueError(
+                f"ppo.mini_batches must be at most num_envs * steps = {num_envs * cfg.steps}, got {cfg.mini_batches}"
+            )
+        t, n, g, a = cfg.steps, num_envs, len(self.names), layout.num_actions
+        self.rollout = Rollout(
+            {k: torch.zeros(t, n, layout.observation_widths[k], dtype=self.dtype, device=device)
+             for k in self.model.normalizers},
+            *(torch.zeros(t, n, width, device=device) for width in (a, a, g, g, g)),
+            torch.zeros(t, n, 1, dtype=torch.bool, device=device),
+        )  # fmt: skip
+        self._step = 0
+
+    def _autocast(self) -> torch.autocast:
+        return torch.autocast(torch.device(self.device).type, torch.bfloat16, enabled=self.dtype == torch.bfloat16)
+
+    @torch.no_grad()
+    def act(self, observations: Observations) -> torch.Tensor:
+        """Sample actions (N, A) and remember what they were based on."""
+        t, r, model = self._step, self.rollout, self.model
+        if t % self.cfg.normalizer_stride == 0:
+            model.update_normalizers(observations)
+        for group, value in model.normalize(observations).items():
+            r.observations[group][t] = value
+        stored = {group: value[t] for group, value in r.observations.items()}
+        with self._autocast():
+            mean = model.mean_action(stored)
+            critic_input = model.read("critic", stored)
+            r.values[t] = torch.cat([model.critics[n](critic_input) for n in self.names], -1)
+        std = torch.cat([model.log_std[n].exp() for n in self.names])
+        actions = mean + std * torch.randn_like(mean)
+        r.means[t], r.actions[t] = mean, actions
+        for g, name in enumerate(self.names):
+            part = self.layout.action_slices[name]
+            r.log_probs[t, :, g] = gaussian_log_prob(actions[:, part], mean[:, part], model.log_std[name])
+        return actions
+
+    @torch.no_grad()
+    def process_step(self, group_rewards: torch.Tensor, dones: torch.Tensor, time_outs: torch.Tensor) -> None:
+        """Record rewards (N, G), dones (N,) and time-outs (N,); the value stands in for what a time-out cut off."""
+        t, r = self._step, self.rollout
+        r.rewards[t] = group_rewards + self.cfg.gamma * r.values[t] * time_outs.unsqueeze(1)
+        r.dones[t] = dones.unsqueeze(1)
+        self._step += 1
+
+    @torch.no_grad()
+    def compute_returns(self, observations: Observations) -> None:
+        """Advantages and returns of the rollout, from the observations after its last step."""
+        r, model = self.rollout, self.model
+        with self._autocast():
+            x = model.read("critic", {g: v.to(self.dtype) for g, v in model.normalize(observations).items()})
+            last = torch.cat([model.critics[n](x) for n in self.names], -1)
+        advantages = generalized_advantages(r.rewards, r.values, last, r.dones, self.cfg.gamma, self.cfg.lam)
+        r.returns = advantages + r.values
+        flat = advantages.flatten(0, 1)
+        r.advantages = (advantages - flat.mean(0)) / (flat.std(0) + 1e-8)
+        self._step = 0
+
+    def update(self) -> dict[str, float]:
+        """Learn from the rollout. Returns mean losses, KL and learning rate per agent, for the log."""
+        r, cfg = self.rollout, self.cfg
+        flat = {
+            key: getattr(r, key).flatten(0, 1)
+            for key in ("actions", "means", "log_probs", "values", "returns", "advantages")
+        }
+        observations = {g: v.flatten(0, 1) for g, v in r.observations.items()}
+        old_log_std = {n: self.model.log_std[n].detach().clone() for n in self.names}
+        total = flat["actions"].shape[0]
+        sums: dict[str, torch.Tensor] = {}
+        for _ in range(cfg.epochs):
+            for ids in torch.randperm(total, device=self.device).chunk(cfg.mini_batches):
+                batch = {key: value[ids] for key, value in flat.items()}
+                inputs = {g: v[ids] for g, v in observations.items()}
+                with self._autocast():
+                    actor_in, critic_in = self.model.read("actor", inputs), self.model.read("critic", inputs)
+                for g, name in enumerate(self.names):
+                    stats = self._update_agent(name, g, actor_in, critic_in, batch, old_log_std[name])
+                    for key, value in stats.items():
+                        sums[f"{name}/{key}"] = sums.get(f"{name}/{key}", torch.zeros(())) + value
+        count = cfg.epochs * cfg.mini_batches
+        log = {key: float(value) / count for key, value in sums.items()}
+        for name in self.names:
+            log[f"{name}/learning_rate"] = self.learning_rates[name]
+            log[f"{name}/action_std"] = float(self.model.log_std[name].detach().exp().mean())
+        return log
+
+    def _update_agent(
+        self, name: str, g: int, actor_in: torch.Tensor, critic_in: torch.Tensor, batch: dict[str, torch.Tensor],
+        old_log_std: torch.Tensor,
+    ) -> dict[str, torch.Tensor]:  # fmt: skip
+        cfg, model = self.cfg, self.model
+        part = self.layout.action_slices[name]
+        with self._autocast():
+            mean = model.actors[name](actor_in)
+            value = model.critics[name](critic_in).squeeze(-1)
+        log_std = model.log_std[name]
+        with torch.no_grad():
+            kl = gaussian_kl(batch["means"][:, part], old_log_std, mean, log_std).mean()
+        self.learning_rates[name] = adapt_learning_rate(self.learning_rates[name], float(kl), cfg.desired_kl)
+        log_prob = gaussian_log_prob(batch["actions"][:, part], mean, log_std)
+        surrogate = clipped_surrogate(log_prob, batch["log_probs"][:, g], batch["advantages"][:, g], cfg.clip)
+        value_loss = clipped_value_loss(value, batch["values"][:, g], batch["returns"][:, g], cfg.clip)
+        entropy = gaussian_entropy(log_std)
+        loss = surrogate + cfg.value * value_loss - cfg.entropy * entropy
+        optimizer = self.optimizers[name]
+        optimizer.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_([*model.actors[name].parameters(), log_std], cfg.max_grad_norm)
+        nn.utils.clip_grad_norm_(model.critics[name].parameters(), cfg.max_grad_norm)
+        for group in optimizer.param_groups:
+            group["lr"] = self.learning_rates[name]
+        optimizer.step()
+        return {"surrogate": surrogate.detach(), "value": value_loss.detach(), "entropy": entropy.detach(), "kl": kl}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Optimisers and learning rates; the networks are saved apart."""
+        return {
+            "optimizers": {name: opt.state_dict() for name, opt in self.optimizers.items()},
+            "learning_rates": dict(self.learning_rates),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take over what `state_dict` returned."""
+        for name, opt in self.optimizers.items():
+            opt.load_state_dict(state["optimizers"][name])
+        self.learning_rates = dict(state["learning_rates"])

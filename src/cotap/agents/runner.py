@@ -1,0 +1,237 @@
+"""The training loop: collect, learn, log, save; stops cleanly and goes on exactly."""
+
+from __future__ import annotations
+
+import json
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from rsl_rl.env import VecEnv
+from rsl_rl.runners import OnPolicyRunner
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
+
+from cotap.agents.actors import AgentLayout
+from cotap.agents.checkpoint import CheckpointError, load_checkpoint, require_layout, save_checkpoint, write_json
+from cotap.agents.dual_ppo import DualPPO, DualPPOConfig
+from cotap.checks import require_positive_int
+
+CHECKPOINT_PATTERN = "checkpoint_*.pt"
+
+
+@dataclass
+class RunnerConfig:
+    """How long to train and how often to save."""
+
+    iterations: int = 400
+    """Iterations in all, those of a resumed run included."""
+    save_interval: int = 25
+    """Iterations between checkpoints."""
+
+    def check(self) -> None:
+        """Raise ValueError naming the first field that is out of its range."""
+        require_positive_int("runner.iterations", self.iterations)
+        require_positive_int("runner.save_interval", self.save_interval)
+
+
+def layout_of(env: VecEnv) -> AgentLayout:
+    """Sizes, action slices and observation groups, asked of the environment."""
+    widths = {group: value.shape[-1] for group, value in env.get_observations().items()}
+    return AgentLayout(widths, env.obs_groups, env.action_slices)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def check_run_dir(run_dir: Path, resuming: bool) -> None:
+    """Refuse a directory that holds another run, or that cannot be written to.
+
+    Raises:
+        ValueError: the directory is used; the message says what to do.
+        OSError: it cannot be created or written to.
+    """
+    if run_dir.exists() and not run_dir.is_dir():
+        raise ValueError(f"run directory {str(run_dir)!r} is a file")
+    if not resuming and any(run_dir.glob(CHECKPOINT_PATTERN)):
+        newest = max(run_dir.glob(CHECKPOINT_PATTERN))
+        raise ValueError(
+            f"run directory {str(run_dir)!r} already holds a run; go on with --resume {newest}, "
+            "or choose another --run-dir"
+        )
+    run_dir.mkdir(parents=True, exist_ok=True)
+    probe = run_dir / ".writable"
+    probe.touch()
+    probe.unlink()
+
+
+class DualRunner(OnPolicyRunner):
+    """rsl_rl's runner for two agents. Replaces its loop, its saving (all that a run depends on) and its loading
+    (no code is run from a file); needs an environment with `action_slices`, `obs_groups` and `state_dict`.
+
+    Args:
+        env: The environment.
+        cfg: How long, how often.
+        ppo: Hyperparameters.
+        run_dir: Where checkpoints and TensorBoard logs go.
+        config: The resolved config as plain data, saved beside the run and in every checkpoint.
+        device: Where the networks live.
+    """
+
+    def __init__(
+        self, env: VecEnv, cfg: RunnerConfig, ppo: DualPPOConfig, run_dir: Path, config: dict[str, Any],
+        device: str = "cpu",
+    ) -> None:  # fmt: skip
+        cfg.check()
+        self.env, self.runner_cfg, self.run_dir, self.config, self.device = env, cfg, run_dir, config, device
+        self.alg: DualPPO = DualPPO(layout_of(env), env.num_envs, ppo, device)  # pyright: ignore
+        self.current_learning_iteration = 0
+        self.wall_seconds = 0.0
+        self._stop = False
+
+    def learn(self, num_learning_iterations: int | None = None, init_at_random_ep_len: bool = False) -> None:
+        """Train up to `runner.iterations` in all (or for so many more), saving at intervals and at the end."""
+        env, alg = self.env, self.alg
+        first = self.current_learning_iteration
+        last = self.runner_cfg.iterations if num_learning_iterations is None else first + num_learning_iterations
+        if init_at_random_ep_len and first == 0:
+            env.episode_length_buf = torch.randint_like(env.episode_length_buf, high=int(env.max_episode_length))
+        write_json(self.run_dir / "config.json", self.config)
+        writer = SummaryWriter(str(self.run_dir), purge_step=first)
+        precision = str(alg.dtype).removeprefix("torch.")
+        tqdm.write(f"{env.num_envs} worlds, networks {alg.cfg.hidden} in {precision} on {self.device}, {self.run_dir}")
+        obs = self._observations()
+        saved = -1
+        with self._signals(), tqdm(total=last, initial=first, unit="it", dynamic_ncols=True) as bar:
+            for it in range(first, last):
+                start = time.perf_counter()
+                log: dict[str, torch.Tensor] = {}
+                for _ in range(alg.cfg.steps):
+                    _, _, dones, extras = env.step(alg.act(obs).to(env.device))
+                    obs = self._observations()
+                    alg.process_step(
+                        extras["group_rewards"].to(self.device),
+                        dones.to(self.device),
+                        extras["time_outs"].to(self.device),
+                    )
+                    for key, value in extras["log"].items():
+                        log[key] = log.get(key, torch.zeros(())) + value
+                alg.compute_returns(obs)
+                collected = time.perf_counter()
+                scalars = {key.lstrip("/"): float(value) / alg.cfg.steps for key, value in log.items()}
+                scalars |= {f"agents/{key}": value for key, value in alg.update().items()}
+                end = time.perf_counter()
+                self.wall_seconds += end - start
+                batch = alg.cfg.steps * env.num_envs
+                scalars |= {
+                    "throughput/steps_per_s": batch / (end - start),
+                    "throughput/collect_s": collected - start,
+                    "throughput/learn_s": end - collected,
+                }
+                self.current_learning_iteration = it + 1
+                for key, value in scalars.items():
+                    writer.add_scalar(key, value, (it + 1) * batch)
+                bar.update()
+                bar.set_postfix_str(_summary(scalars))
+                if (it + 1) % self.runner_cfg.save_interval == 0:
+                    self.save()
+                    saved = it + 1
+                if self._stop:
+                    tqdm.write("stopping: saving a checkpoint")
+                    break
+        if saved != self.current_learning_iteration:
+            self.save()
+        writer.close()
+
+    def save(self, path: str | None = None, infos: dict | None = None) -> None:
+        """Save everything to go on exactly; the previous checkpoint then sheds its simulator states."""
+        target = Path(path) if path else self.run_dir / f"checkpoint_{self.current_learning_iteration:06d}.pt"
+        save_checkpoint(target, self._content() | {"infos": infos or {}})
+        for older in sorted(self.run_dir.glob(CHECKPOINT_PATTERN)):
+            if older < target and older.stat().st_size > 0.5 * target.stat().st_size:
+                content = load_checkpoint(older)
+                if content["env"]:
+                    save_checkpoint(older, content | {"env": {}})
+
+    def load(
+        self, path: str, load_cfg: dict | None = None, strict: bool = True, map_location: str | None = None
+    ) -> dict:
+        """Load a checkpoint. What it lacks (a shipped one has no optimiser or simulator states) starts afresh.
+
+        Raises:
+            CheckpointError: the file cannot be used, or was trained for another robot or observation layout.
+        """
+        content = load_checkpoint(path, map_location or self.device)
+        env: Any = self.env
+        require_layout(path, content["layout"], json.loads(json.dumps(env.layout())))
+        try:
+            self.alg.model.load_state_dict(content["model"])
+        except RuntimeError as error:
+            raise CheckpointError(f"checkpoint {path!r} has other networks: {error}") from error
+        fresh: list[str] = []
+        if content["learner"]:
+            self.alg.load_state_dict(content["learner"])
+            self.current_learning_iteration = content["iteration"]
+            self.wall_seconds = content["wall_seconds"]
+            torch.set_rng_state(content["rng"].cpu())
+        else:
+            fresh.append("optimisers")
+        if content["env"] and content["env"]["episode_length"].shape[0] == env.num_envs:
+            env.load_state_dict(content["env"])
+        else:
+            env.samples = content["samples"]
+            fresh.append("simulator states")
+        if fresh:
+            tqdm.write(f"{path}: no {' and '.join(fresh)} for this run; starting those afresh")
+        return content["infos"]
+
+    def _content(self) -> dict[str, Any]:
+        env: Any = self.env
+        return {
+            "kind": self.config.get("stage", "base"),
+            "layout": json.loads(json.dumps(env.layout())),
+            "config": self.config,
+            "model": self.alg.model.state_dict(),
+            "learner": self.alg.state_dict(),
+            "env": env.state_dict(),
+            "iteration": self.current_learning_iteration,
+            "samples": env.samples,
+            "wall_seconds": self.wall_seconds,
+            "rng": torch.get_rng_state(),
+        }
+
+    def _observations(self) -> dict[str, torch.Tensor]:
+        return {k: v.to(self.device) for k, v in self.env.get_observations().items()}
+
+    @contextmanager
+    def _signals(self) -> Iterator[None]:
+        """Ctrl-C and SIGTERM end the run after the present iteration, with a checkpoint; a second one at once."""
+
+        def stop(number: int, _frame: Any) -> None:
+            if self._stop:
+                raise KeyboardInterrupt
+            self._stop = True
+
+        handlers: dict[int, Callable[..., Any] | int | None] = {}
+        try:
+            for number in (signal.SIGINT, signal.SIGTERM):
+                handlers[number] = signal.signal(number, stop)
+        except ValueError:  # not the main thread: whoever owns it handles signals
+            pass
+        try:
+            yield
+        finally:
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+
+
+def _summary(s: dict[str, float]) -> str:
+    shown = {
+        "steps/s": s["throughput/steps_per_s"],
+        "err": s.get("command/error_velocity"),
+        "slope": s.get("command/slope_x"),
+        "falls/s": s.get("episode/falls_per_s"),
+    }
+    return " ".join(f"{k} {v:.3g}" for k, v in shown.items() if v is not None)

@@ -1,0 +1,1 @@
+"""Kinematics of serial arms in pure torch: usable alone, without a simulator."""

@@ -1,0 +1,63 @@
+"""Forward kinematics of serial chains of hinges, batched over worlds and over chains of equal length."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from cotap.rotations import matrix_from_quat
+
+
+@dataclass(frozen=True)
+class ChainPose:
+    """Where the links of a chain are, in the frame of its root. W worlds, A chains, n joints."""
+
+    anchors: torch.Tensor
+    """Joint origins, (W, A, n, 3) [m]."""
+    axes: torch.Tensor
+    """Joint axes, (W, A, n, 3), unit vectors."""
+    rotation: torch.Tensor
+    """Orientation of the last link, (W, A, 3, 3)."""
+    tip: torch.Tensor
+    """The tip point on the last link, (W, A, 3) [m]."""
+
+
+class SerialChains:
+    """Hinge chains rooted in one body, such as the two arms of a torso.
+
+    Args:
+        offsets: Position of each link in its parent's frame, (A, n, 3) [m].
+        quats: Its orientation there at zero angle, (A, n, 4).
+        axes: Joint axes in the links' frames, (A, n, 3).
+        tip: The tip point in the last link's frame, (A, 3) [m].
+    """
+
+    def __init__(self, offsets: torch.Tensor, quats: torch.Tensor, axes: torch.Tensor, tip: torch.Tensor) -> None:
+        self.offsets, self.axes, self.tip = offsets, axes, tip
+        self.num_joints = offsets.shape[1]
+        self._fixed = matrix_from_quat(quats)
+        # Rodrigues' formula, R = I + sin(q) W + (1 - cos(q)) W^2, with the fixed rotation multiplied in beforehand.
+        x, y, z = axes.unbind(-1)
+        zero = torch.zeros_like(x)
+        skew = torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), -1).unflatten(-1, (3, 3))
+        self._sine, self._versine = self._fixed @ skew, self._fixed @ skew @ skew
+
+    def pose(self, q: torch.Tensor) -> ChainPose:
+        """Pose of every link for joint angles `q` (W, A, n) [rad]."""
+        sine, versine = q.sin()[..., None, None], (1.0 - q.cos())[..., None, None]
+        local = self._fixed + sine * self._sine + versine * self._versine  # (W, A, n, 3, 3)
+        position, rotation = self.offsets[:, 0].expand(q.shape[0], -1, 3), local[:, :, 0]
+        anchors, axes = [position], [(rotation @ self.axes[:, 0, :, None]).squeeze(-1)]
+        for i in range(1, self.num_joints):
+            position = position + (rotation @ self.offsets[:, i, :, None]).squeeze(-1)
+            rotation = rotation @ local[:, :, i]
+            anchors.append(position)
+            axes.append((rotation @ self.axes[:, i, :, None]).squeeze(-1))
+        tip = position + (rotation @ self.tip[..., None]).squeeze(-1)
+        return ChainPose(torch.stack(anchors, 2), torch.stack(axes, 2), rotation, tip)
+
+    @staticmethod
+    def jacobian(pose: ChainPose) -> torch.Tensor:
+        """Jacobian of the tip's position in the root frame, (W, A, 3, n) [m/rad]."""
+        return torch.linalg.cross(pose.axes, pose.tip.unsqueeze(2) - pose.anchors).transpose(-1, -2)

@@ -1,0 +1,42 @@
+"""Recipes of stage 1: PD control on all joints; legs follow commands, arms a reference."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from cotap.agents.dual_ppo import DualPPOConfig
+from cotap.agents.runner import RunnerConfig
+from cotap.envs import H1EnvConfig
+
+
+@dataclass
+class BaseTraining:
+    """All of a base run."""
+
+    seed: int = 0
+    """Seed of networks, exploration and environment."""
+    threads: int = 0
+    """Processor threads of torch and physics; 0 takes every processor. A run is reproducible for one number."""
+    device: str = "cpu"
+    """Where the networks live; physics is on the processor."""
+    env: H1EnvConfig = field(default_factory=H1EnvConfig)
+    ppo: DualPPOConfig = field(default_factory=DualPPOConfig)
+    runner: RunnerConfig = field(default_factory=RunnerConfig)
+
+
+def default() -> BaseTraining:
+    """What the shipped base policy was trained with."""
+    training = BaseTraining()
+    training.env.assist.enabled = True
+    return training
+
+
+def paper() -> BaseTraining:
+    """The paper's networks, otherwise the default."""
+    training = default()
+    training.ppo.hidden = (512, 256, 128)
+    return training
+
+
+BASE_RECIPES: dict[str, Callable[[], BaseTraining]] = {"default": default, "paper": paper}

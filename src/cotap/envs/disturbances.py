@@ -1,0 +1,151 @@
+"""Forces on the robot from outside: random loads at the hands, and the assistance that early training leans on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from cotap.checks import require_interval, require_range
+from cotap.envs.persistence import Stateful, uniform
+
+
+@dataclass
+class HandForceConfig:
+    """Random hand forces (FALCON's), held for a while, in the heading frame."""
+
+    enabled: bool = True
+    """Whether hands are loaded at all."""
+    force_x: tuple[float, float] = (-40.0, 40.0)
+    """[N]."""
+    force_y: tuple[float, float] = (-40.0, 40.0)
+    """[N]."""
+    force_z: tuple[float, float] = (-50.0, 5.0)
+    """[N]."""
+    zero_probability: float = 0.25
+    """Chance of each axis of each hand to be free."""
+    hold_s: tuple[float, float] = (3.0, 5.0)
+    """Time between changes [s]."""
+    torque_share: float = 0.8
+    """Forces are scaled down to what this share of the arm's torque limits can hold."""
+    curriculum_start: float = 0.0
+    """Share of the force with which worlds begin."""
+    curriculum_step: float = 0.05
+    """Change of a world's share after an episode: up when it lasted, down when the robot fell early."""
+
+    def check(self) -> None:
+        """Raise ValueError naming the first field that is out of its range."""
+        for name in ("force_x", "force_y", "force_z", "hold_s"):
+            require_interval(f"hand_forces.{name}", getattr(self, name))
+        require_range("hand_forces.hold_s[0]", self.hold_s[0], 0.02, 1e6)
+        for name in ("zero_probability", "torque_share", "curriculum_start", "curriculum_step"):
+            require_range(f"hand_forces.{name}", getattr(self, name), 0.0, 1.0)
+
+
+class HandForces(Stateful):
+    """Piecewise constant forces at each hand, with a curriculum per world."""
+
+    STATE = ("_force_h", "_remaining_s", "scale")
+
+    def __init__(self, cfg: HandForceConfig, num_envs: int, num_hands: int, dt: float) -> None:
+        cfg.check()
+        self.cfg, self._dt = cfg, dt
+        self._force_h = torch.zeros(num_envs, num_hands, 3)
+        self._remaining_s = torch.zeros(num_envs)
+        self.scale = torch.full((num_envs,), cfg.curriculum_start)
+
+    def finish_episodes(self, lasted: torch.Tensor, fell_early: torch.Tensor) -> None:
+        """Adapt the curriculum of worlds whose episode ended; both masks (num_envs,) bool."""
+        step = self.cfg.curriculum_step * (lasted.float() - fell_early.float())
+        self.scale = (self.scale + step).clamp(0.0, 1.0)
+
+    def reset(self, mask: torch.Tensor, rng: torch.Generator) -> None:
+        """New forces for the worlds of `mask`."""
+        n, hands = int(mask.sum()), self._force_h.shape[1]
+        if n == 0 or not self.cfg.enabled:
+            return
+        cfg = self.cfg
+        bounds = (cfg.force_x, cfg.force_y, cfg.force_z)
+        force = torch.stack([uniform(rng, *b, n, hands) for b in bounds], -1)
+        self._force_h[mask] = force * (torch.rand(n, hands, 3, generator=rng) >= cfg.zero_probability)
+        self._remaining_s[mask] = uniform(rng, *cfg.hold_s, n)
+
+    def step(self, rng: torch.Generator) -> None:
+        """Advance by one control step; forces that have been held long enough change."""
+        self._remaining_s = self._remaining_s - self._dt
+        self.reset(self._remaining_s <= 0.0, rng)
+
+    def current(self, jacobian_h: torch.Tensor, torque_limit: torch.Tensor) -> torch.Tensor:
+        """Forces (N, hands, 3) in the heading frame, never beyond what the arms' torque limits can hold.
+
+        Args:
+            jacobian_h: (N, hands, 3, n) hand Jacobians in the heading frame.
+            torque_limit: (hands, n) [Nm].
+        """
+        force = self._force_h * self.scale[:, None, None]
+        torque = (jacobian_h.transpose(-1, -2) @ force.unsqueeze(-1)).squeeze(-1).abs()
+        holdable = (self.cfg.torque_share * torque_limit / torque.clamp_min(1e-6)).amin(-1).clamp_max(1.0)
+        return force * holdable.unsqueeze(-1)
+
+
+@dataclass
+class AssistConfig:
+    """A wrench on the base that carries the robot through its first steps and fades to nothing.
+
+    Without it, standing still is a local optimum that plain reward tables do not leave.
+    """
+
+    enabled: bool = False
+    """Whether to assist; training switches it on."""
+    full_samples: float = 2e6
+    """Environment steps, over all worlds, with full assistance."""
+    end_samples: float = 9e6
+    """Environment steps after which there is none."""
+    upright_stiffness: float = 400.0
+    """[Nm/rad]."""
+    upright_damping: float = 40.0
+    """[Nms/rad]."""
+    velocity_gain: float = 300.0
+    """Horizontal pull towards the commanded velocity [N per m/s]."""
+    force_limit: float = 150.0
+    """Largest pull [N]."""
+    weight_share: float = 0.25
+    """Share of the robot's weight that is lifted."""
+
+    def check(self) -> None:
+        """Raise ValueError naming the first field that is out of its range."""
+        require_range("assist.full_samples", self.full_samples, 0.0, self.end_samples)
+        require_range("assist.weight_share", self.weight_share, 0.0, 1.0)
+        for name in ("upright_stiffness", "upright_damping", "velocity_gain", "force_limit"):
+            require_range(f"assist.{name}", getattr(self, name), 0.0, 1e6)
+
+    def share(self, samples: float) -> float:
+        """Share of the assistance left after `samples` environment steps."""
+        if not self.enabled:
+            return 0.0
+        if samples <= self.full_samples:
+            return 1.0
+        return max(0.0, 1.0 - (samples - self.full_samples) / max(self.end_samples - self.full_samples, 1.0))
+
+
+def assist_wrench(
+    cfg: AssistConfig, weight_n: float, up_w: torch.Tensor, angular_velocity_w: torch.Tensor,
+    velocity_error_w: torch.Tensor,
+) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
+    """Force and torque (N, 3) on the base, world frame, at full assistance.
+
+    Args:
+        cfg: Gains.
+        weight_n: Weight of the robot [N].
+        up_w: (N, 3) the base's z axis.
+        angular_velocity_w: (N, 3) [rad/s].
+        velocity_error_w: (N, 2) commanded minus actual horizontal velocity [m/s].
+    """
+    vertical = torch.tensor([0.0, 0.0, 1.0]).expand_as(up_w)
+    upright = cfg.upright_stiffness * torch.linalg.cross(up_w, vertical)
+    tilt_rate = angular_velocity_w * torch.tensor([1.0, 1.0, 0.0])
+    pull = cfg.velocity_gain * velocity_error_w
+    size = pull.norm(dim=1, keepdim=True).clamp_min(1e-6)
+    pull = pull * (cfg.force_limit / size).clamp_max(1.0)
+    lift = torch.full_like(pull[:, :1], cfg.weight_share * weight_n)
+    return torch.cat((pull, lift), 1), upright - cfg.upright_damping * tilt_rate

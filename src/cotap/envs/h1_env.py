@@ -1,0 +1,490 @@
+"""The environment: the order of a step, and nothing else. Every part lives in a module of its own."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import torch
+from rsl_rl.env import VecEnv
+from tensordict import TensorDict
+
+from cotap.checks import require_all_finite, require_one_of, require_positive_int, require_range, require_shape
+from cotap.compliance.kinematics import ChainPose
+from cotap.envs.commands import Command, CommandConfig, CommandSource, desired_contact, swing_progress
+from cotap.envs.disturbances import AssistConfig, HandForceConfig, HandForces, assist_wrench
+from cotap.envs.motions import ArmReference, MotionConfig, MotionGenerator
+from cotap.envs.observations import (
+    ObservationConfig,
+    ObservationHistory,
+    actor_terms,
+    critic_terms,
+    noise_amplitude,
+)
+from cotap.envs.persistence import uniform
+from cotap.envs.randomization import RandomizationConfig, Randomizer
+from cotap.envs.rewards import LowerRewards, RewardGroup, StepRecord, UpperRewards
+from cotap.envs.state import RobotState, StateReader
+from cotap.envs.terminations import TerminationConfig, diverged, fallen
+from cotap.robots import ROBOTS
+from cotap.robots.mjcf import COLLISIONS, build_model
+from cotap.rotations import heading_matrix, quat_about_z, quat_from_matrix, rotate
+from cotap.sim import DelayedTargets, Simulation
+
+GRAVITY = 9.81
+
+
+@dataclass
+class ActionConfig:
+    """How actions become joint targets."""
+
+    lower_scale: float = 0.25
+    """Radians per unit of lower action, added to the default pose."""
+    upper_scale: float = 0.1
+    """Radians per unit of upper action, added to the reference (residual) or to the default pose (absolute)."""
+    upper_mode: str = "residual"
+    """residual (FALCON) or absolute (the paper)."""
+    clip: float = 20.0
+    """Largest magnitude of an action."""
+
+    def check(self) -> None:
+        """Raise ValueError naming the first field that is out of its range."""
+        require_range("actions.lower_scale", self.lower_scale, 0.0, 10.0)
+        require_range("actions.upper_scale", self.upper_scale, 0.0, 10.0)
+        require_range("actions.clip", self.clip, 1e-3, 1e6)
+        require_one_of("actions.upper_mode", self.upper_mode, ("residual", "absolute"))
+
+
+@dataclass
+class RewardConfig:
+    """Weights of both agents' rewards."""
+
+    lower: LowerRewards = field(default_factory=LowerRewards)
+    upper: UpperRewards = field(default_factory=UpperRewards)
+
+
+@dataclass
+class H1EnvConfig:
+    """Everything that defines the environment."""
+
+    robot: str = "h1"
+    """Name of the robot."""
+    num_envs: int = 2048
+    """Number of worlds."""
+    seed: int = 0
+    """Seed of the environment's own random numbers."""
+    num_threads: int = 0
+    """Physics threads; 0 takes every processor."""
+    collision: str = "feet"
+    """feet (only feet meet the floor) or full."""
+    control_dt: float = 0.02
+    """Control step [s]."""
+    substeps: int = 2
+    """Physics steps per control step."""
+    torque_limit_scale: float = 1.0
+    """Factor on the robot's torque limits."""
+    actions: ActionConfig = field(default_factory=ActionConfig)
+    observations: ObservationConfig = field(default_factory=ObservationConfig)
+    commands: CommandConfig = field(default_factory=CommandConfig)
+    motions: MotionConfig = field(default_factory=MotionConfig)
+    rewards: RewardConfig = field(default_factory=RewardConfig)
+    terminations: TerminationConfig = field(default_factory=TerminationConfig)
+    randomization: RandomizationConfig = field(default_factory=RandomizationConfig)
+    hand_forces: HandForceConfig = field(default_factory=HandForceConfig)
+    assist: AssistConfig = field(default_factory=AssistConfig)
+
+    def check(self) -> None:
+        """Raise ValueError naming the first field that is out of its range."""
+        require_positive_int("num_envs", self.num_envs)
+        require_positive_int("substeps", self.substeps)
+        require_one_of("robot", self.robot, ROBOTS.keys())
+        require_one_of("collision", self.collision, COLLISIONS)
+        require_range("control_dt", self.control_dt, 1e-4, 1.0)
+        require_range("torque_limit_scale", self.torque_limit_scale, 1e-3, 1e3)
+        for part in (self.actions, self.observations, self.commands, self.motions, self.terminations, self.hand_forces,
+                     self.assist):  # fmt: skip
+            part.check()
+        self.randomization.check(self.control_dt)
+
+
+class H1Env(VecEnv):
+    """N robots that walk with their legs and follow a reference with their arms.
+
+    One step, in order: actions to targets; physics, forces held and targets arriving late; state read once; clocks of
+    commands, motion and forces advance; falls, divergence and time-outs found; rewards from the record of the step;
+    ended worlds restart; observations. After a step, everything in an observation is current, except that worlds'
+    foot sensors (rewards only) lag one physics step.
+
+    `action_slices` and `reward_groups` tell agents, by name, which actions and which reward are theirs; `step` returns
+    the sum of the groups' rewards, and each group's in `extras["group_rewards"]` (N, groups).
+
+    Raises:
+        ValueError: a field of the config is out of its range.
+    """
+
+    reward_groups = ("lower", "upper")
+
+    def __init__(self, cfg: H1EnvConfig | None = None) -> None:
+        self.cfg = cfg = cfg or H1EnvConfig()
+        cfg.check()
+        self.device = "cpu"
+        self.num_envs = n = cfg.num_envs
+        self.spec = spec = ROBOTS[cfg.robot]()
+        self.num_actions = len(spec.joints)
+        self.num_lower = len(spec.lower_joints)
+        self.action_slices = {"lower": slice(0, self.num_lower), "upper": slice(self.num_lower, self.num_actions)}
+        self.rng = torch.Generator().manual_seed(cfg.seed)
+
+        model = build_model(spec, cfg.collision, cfg.control_dt / cfg.substeps)
+        model.actuator_forcerange[:] *= cfg.torque_limit_scale
+        self.sim = Simulation(model, n, cfg.substeps, cfg.num_threads, Randomizer.FIELDS)
+        self.dt = self.sim.dt
+        self.max_episode_length = math.ceil(cfg.terminations.episode_s / self.dt)
+
+        joints = spec.joints
+        self._default = torch.tensor([j.default_rad for j in joints])
+        self._torque_limit = cfg.torque_limit_scale * torch.tensor([j.torque_limit_nm for j in joints])
+        low, high = torch.tensor([j.range_rad for j in joints]).unbind(1)
+        center, half = (low + high) / 2, 0.95 * (high - low) / 2
+        self._soft_limits = (center - half, center + half)
+        self._sideways = tuple(
+            i for i, j in enumerate(joints[: self.num_lower]) if j.mirror_sign < 0.0
+        )  # yaw and roll joints
+        self._action_scale = torch.full((self.num_actions,), cfg.actions.lower_scale)
+        self._action_scale[self.num_lower :] = cfg.actions.upper_scale
+
+        self.reader = StateReader(spec, self.sim)
+        self._arm_limits = self.reader.arm_joints(self._torque_limit.unsqueeze(0))[0]
+        self._hand_bodies = [model.body(arm.hand_body).id for arm in spec.arms]
+        self._hand_lever = torch.stack(
+            [torch.tensor(a.hand_point) - torch.tensor(spec.body(a.hand_body).com) for a in spec.arms]
+        )
+        self._elbow_joints = [
+            [b.name for b in spec.chain(a.hand_body, spec.torso_body)].index(a.elbow_body) for a in spec.arms
+        ]
+        self._base_body = model.body(spec.base_body).id
+        self._weight_n = float(model.body_mass.sum()) * GRAVITY
+
+        self.commands = CommandSource(cfg.commands, n, spec.nominal_height_m, self.dt)
+        self.motions = MotionGenerator(cfg.motions, spec, n, self.dt)
+        self.hand_forces = HandForces(cfg.hand_forces, n, len(spec.arms), self.dt)
+        self.randomizer = Randomizer(cfg.randomization, spec, self.sim)
+        self.targets = DelayedTargets(n, self.num_actions, cfg.substeps, self.dt)
+        terms = actor_terms(self.num_actions, self.num_actions - self.num_lower)
+        self.history = ObservationHistory(terms, n, cfg.observations.history)
+        self._clean_history = ObservationHistory(terms, n, cfg.observations.history)
+        self._noise = noise_amplitude(terms, cfg.observations.noise)
+        self._critic_scale = torch.cat([torch.full((w,), s) for _, w, s in critic_terms(len(spec.arms))])
+        self._groups = (
+            RewardGroup("lower", cfg.rewards.lower, self.dt),
+            RewardGroup("upper", cfg.rewards.upper, self.dt),
+        )
+
+        self.samples = 0
+        self.num_diverged = 0
+        self.episode_length_buf = torch.zeros(n, dtype=torch.long)
+        self._last_action = torch.zeros(n, self.num_actions)
+        self._hand_force_w = torch.zeros(n, len(spec.arms), 3)
+        self._kp, self._kd = self.randomizer.gains()
+        self.randomizer.randomize_bodies(self.rng)
+        self.state: RobotState
+        self.reset()
+
+    @property
+    def obs_groups(self) -> dict[str, list[str]]:
+        """Which observation groups actors and critics read (rsl_rl's `obs_groups`)."""
+        noisy = self.cfg.observations.noise.enabled
+        return {"actor": ["policy"], "critic": ["clean" if noisy else "policy", "privileged"]}
+
+    def layout(self) -> dict[str, Any]:
+        """What a policy must agree with: robot, joints, observation terms, action convention."""
+        c = self.cfg
+        return {
+            "robot": self.spec.name,
+            "joints": list(self.spec.joint_names),
+            "terms": [list(t) for t in self.history.terms],
+            "history": self.history.steps,
+            "critic_terms": [list(t) for t in critic_terms(len(self.spec.arms))],
+            "actions": asdict(c.actions),
+            "control_dt": c.control_dt,
+        }
+
+    def reset(self) -> TensorDict:
+        """Restart every world and return the observations."""
+        everyone = torch.ones(self.num_envs, dtype=torch.bool)
+        self._restart(everyone)
+        self._observe(everyone)
+        return self._observations
+
+    def get_observations(self) -> TensorDict:
+        """The present observations: `policy` (N, 430), `privileged` (N, 13), and `clean` where sensors are noisy."""
+        return self._observations
+
+    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
+        """Advance by one control step.
+
+        Args:
+            actions: (N, J).
+
+        Returns:
+            Observations, rewards (N,), dones (N,), extras with `time_outs` (N,), `falls` (N,), `group_rewards`
+            (N, groups), `log`.
+
+        Raises:
+            ValueError: actions have another shape or are not finite.
+        """
+        require_shape("actions", actions, (self.num_envs, self.num_actions))
+        require_all_finite("actions", actions)
+        action = actions.clamp(-self.cfg.actions.clip, self.cfg.actions.clip)
+        self.targets.send(self.target_from_action(action))
+        velocity_before = self.state.joint_vel
+        self._apply_forces()
+        self.sim.step(self._drive)
+
+        bad = diverged(self.sim.qpos, self.sim.qvel)
+        self.state = self.reader.read()
+        self.samples += self.num_envs
+        self.episode_length_buf += 1
+        self.commands.step(self.rng)
+        self.motions.step(self.rng)
+        self.hand_forces.step(self.rng)
+
+        fell = fallen(self.cfg.terminations, self.state.height, self.state.projected_gravity_t) | bad
+        time_out = (self.episode_length_buf >= self.max_episode_length) & ~fell
+        record = self._record(action, velocity_before, fell)
+        self.record = record
+        rewards, log = self._reward(record, bad)
+        self._last_action = action
+        done = fell | time_out
+        log.update(self._log(record, fell, time_out, bad))
+        if done.any():
+            self._finish(done, fell)
+            self._restart(done)
+        self._observe(done)
+        extras = {"time_outs": time_out, "falls": fell, "group_rewards": rewards, "log": log}
+        return self._observations, rewards.sum(1), done, extras
+
+    def target_from_action(self, action: torch.Tensor) -> torch.Tensor:
+        """Joint targets (N, J) [rad] of actions (N, J), for the present arm reference."""
+        target = self._default + self._action_scale * action
+        if self.cfg.actions.upper_mode == "residual":
+            upper = slice(self.num_lower, None)
+            target[:, upper] += self.motions.current().position - self._default[upper]
+        return target
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that the environment's future depends on."""
+        snapshot = self.sim.snapshot()
+        return {
+            "sim": {"state": snapshot.state, "sensors": snapshot.sensors, "fields": snapshot.fields},
+            "parts": {name: part.state_dict() for name, part in self._parts().items()},
+            "delay": {
+                "delay_s": self.targets.delay_s,
+                "previous": self.targets.previous,
+                "current": self.targets.current,
+            },
+            "episode_length": self.episode_length_buf.clone(),
+            "last_action": self._last_action.clone(),
+            "observations": dict(self._observations.items()),
+            "counters": {"samples": self.samples, "num_diverged": self.num_diverged},
+            "rng": self.rng.get_state(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on exactly where `state_dict` was taken. Raises ValueError for another number of worlds."""
+        from cotap.sim import Snapshot
+
+        self.sim.restore(Snapshot(**state["sim"]))
+        for name, part in self._parts().items():
+            part.load_state_dict(state["parts"][name])
+        for name, value in state["delay"].items():
+            setattr(self.targets, name, value.clone())
+        self._kp, self._kd = self.randomizer.gains()
+        self.episode_length_buf = state["episode_length"].clone()
+        self._last_action = state["last_action"].clone()
+        self._observations = TensorDict(state["observations"], batch_size=[self.num_envs])
+        self.samples = state["counters"]["samples"]
+        self.num_diverged = state["counters"]["num_diverged"]
+        self.rng.set_state(state["rng"])
+        self.state = self.reader.read()
+
+    def _parts(self) -> dict[str, Any]:
+        return {
+            "commands": self.commands,
+            "motions": self.motions,
+            "hand_forces": self.hand_forces,
+            "randomizer": self.randomizer,
+            "history": self.history,
+            "clean_history": self._clean_history,
+        }
+
+    def _drive(self, substep: int) -> torch.Tensor:
+        """PD control: the actuators subtract `kp q + kd dq` themselves."""
+        return self._kp * self.targets.at(substep)
+
+    def _apply_forces(self) -> None:
+        s = self.state
+        to_heading = s.heading_w.transpose(1, 2) @ s.torso_rotation_w
+        jacobian_h = to_heading.unsqueeze(1) @ self.reader.arm_chains.jacobian(s.arms)
+        force_h = self.hand_forces.current(jacobian_h, self._arm_limits)
+        self._hand_force_w = (s.heading_w.unsqueeze(1) @ force_h.unsqueeze(-1)).squeeze(-1)
+        hand_rotation_w = s.torso_rotation_w.unsqueeze(1) @ s.arms.rotation
+        lever_w = rotate(hand_rotation_w, self._hand_lever)
+        for i, body in enumerate(self._hand_bodies):
+            self.sim.apply_force(body, self._hand_force_w[:, i], lever_w[:, i])
+        share = self.cfg.assist.share(self.samples)
+        if share > 0.0 or self.cfg.assist.enabled:
+            command = self.commands.current()
+            error_h = torch.nn.functional.pad(command.velocity_h - s.torso_linear_velocity_h[:, :2], (0, 1))
+            force, torque = assist_wrench(
+                self.cfg.assist, self._weight_n, s.torso_rotation_w[:, :, 2],
+                rotate(s.torso_rotation_w, s.torso_angular_velocity_t), rotate(s.heading_w, error_h)[:, :2],
+            )  # fmt: skip
+            self.sim.xfrc[:, self._base_body] = share * torch.cat((force, torque), 1).double()
+
+    def _record(self, action: torch.Tensor, velocity_before: torch.Tensor, fell: torch.Tensor) -> StepRecord:
+        s, command, reference = self.state, self.commands.current(), self.motions.current()
+        num_feet = len(self.spec.feet)
+        arms_reference = self.reader.arm_chains.pose(reference.position.unflatten(1, (len(self.spec.arms), -1)))
+        points, velocities = self._key_points(s.arms, self.reader.arm_joints(s.joint_vel))
+        ref_points, ref_velocities = self._key_points(
+            arms_reference, reference.velocity.unflatten(1, (len(self.spec.arms), -1))
+        )
+        return StepRecord(
+            state=s,
+            command=command,
+            reference=reference,
+            action=action,
+            last_action=self._last_action,
+            joint_acceleration=(s.joint_vel - velocity_before) / self.dt,
+            torque=self.joint_torque(s),
+            desired_contact=desired_contact(command.phase, command.stand, num_feet),
+            swing=swing_progress(command.phase, num_feet),
+            key_points_t=points,
+            key_points_reference_t=ref_points,
+            key_velocities_t=velocities,
+            key_velocities_reference_t=ref_velocities,
+            fell=fell,
+            joint_low=self._soft_limits[0],
+            joint_high=self._soft_limits[1],
+            num_lower=self.num_lower,
+            default_position=self._default,
+            sideways=self._sideways,
+        )
+
+    def joint_torque(self, state: RobotState) -> torch.Tensor:
+        """Torque (N, J) [Nm] that the law in force gives at `state`."""
+        torque = self._kp * (self.targets.at(self.cfg.substeps - 1) - state.joint_pos) - self._kd * state.joint_vel
+        return torch.clamp(torque, -self._torque_limit, self._torque_limit)
+
+    def _key_points(self, arms: ChainPose, rates: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Hands and elbows (N, 2A, 3) in the torso frame and their velocities there, for joint rates (N, A, n)."""
+        elbows = torch.stack([arms.anchors[:, a, j] for a, j in enumerate(self._elbow_joints)], 1)
+        spin = arms.axes * rates.unsqueeze(-1)
+        hand_velocity = torch.linalg.cross(spin, arms.tip.unsqueeze(2) - arms.anchors).sum(2)
+        elbow_velocity = torch.stack(
+            [
+                torch.linalg.cross(spin[:, a, :j], elbows[:, a, None] - arms.anchors[:, a, :j]).sum(1)
+                for a, j in enumerate(self._elbow_joints)
+            ],
+            1,
+        )
+        return torch.cat((arms.tip, elbows), 1), torch.cat((hand_velocity, elbow_velocity), 1)
+
+    def _reward(self, record: StepRecord, bad: torch.Tensor) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        totals: list[torch.Tensor] = []
+        log: dict[str, torch.Tensor] = {}
+        for group in self._groups:
+            total, terms = group(record)
+            # A diverged world has no meaningful reward; its episode ends and is counted.
+            totals.append(torch.where(bad, torch.zeros_like(total), total))
+            log.update({f"/{group.name}/{name}": value[~bad].mean() for name, value in terms.items()})
+        return torch.stack(totals, 1), log
+
+    def _log(
+        self, r: StepRecord, fell: torch.Tensor, time_out: torch.Tensor, bad: torch.Tensor
+    ) -> dict[str, torch.Tensor]:
+        self.num_diverged += int(bad.sum())
+        ok = ~bad
+        measured = torch.cat((r.state.torso_linear_velocity_h[:, :2], r.state.yaw_rate.unsqueeze(1)), 1)[ok]
+        commanded = torch.cat((r.command.velocity_h, r.command.yaw_rate.unsqueeze(1)), 1)[ok]
+        slope = (measured * commanded).sum(0) / commanded.square().sum(0).clamp_min(1e-6)
+        error = (measured - commanded).abs()
+        arm_error = (r.state.joint_pos[:, self.num_lower :] - r.reference.position)[ok].norm(dim=1)
+        swing_speed = r.state.foot_pos_w[ok][:, :, 2].amax(1)
+        return {
+            "/command/error_velocity": (measured - commanded)[:, :2].norm(dim=1).mean(),
+            "/command/error_yaw_rate": error[:, 2].mean(),
+            "/command/error_height": (r.state.height - r.command.height)[ok].abs().mean(),
+            "/command/slope_x": slope[0],
+            "/command/slope_y": slope[1],
+            "/command/slope_yaw": slope[2],
+            "/command/e_upper": arm_error.mean(),
+            "/command/highest_foot": swing_speed.mean(),
+            "/episode/falls_per_s": fell.float().mean() / self.dt,
+            "/episode/time_outs_per_s": time_out.float().mean() / self.dt,
+            "/episode/diverged": torch.tensor(float(self.num_diverged)),
+            "/curriculum/hand_force": self.hand_forces.scale.mean(),
+            "/curriculum/assist": torch.tensor(self.cfg.assist.share(self.samples)),
+        }
+
+    def _finish(self, done: torch.Tensor, fell: torch.Tensor) -> None:
+        long_enough = self.episode_length_buf >= 0.75 * self.max_episode_length
+        self.hand_forces.finish_episodes(done & long_enough, done & fell & ~long_enough)
+
+    def _restart(self, mask: torch.Tensor) -> None:
+        """Put the worlds of `mask` on their feet: default legs with noise, arms on their reference, random heading."""
+        n = int(mask.sum())
+        self.randomizer.randomize_episode(mask, self.targets.delay_s, self.rng)
+        self._kp, self._kd = self.randomizer.gains()
+        self.commands.reset(mask, self.rng)
+        self.motions.reset(mask, self.rng)
+        self.hand_forces.reset(mask, self.rng)
+        joints = self._default + uniform(self.rng, -0.1, 0.1, n, self.num_actions)
+        joints[:, self.num_lower :] = self.motions.current().position[mask]
+        position = torch.zeros(n, 3)
+        position[:, 2] = self.spec.nominal_height_m + 0.01
+        yaw = uniform(self.rng, -math.pi, math.pi, n)
+        qpos = torch.cat((position, quat_about_z(yaw), joints), 1)
+        qvel = torch.cat((uniform(self.rng, -0.2, 0.2, n, 6), torch.zeros(n, self.num_actions)), 1)
+        self.sim.reset(mask, qpos, qvel)
+        self.targets.reset(mask, joints)
+        self._last_action[mask] = 0.0
+        self.episode_length_buf[mask] = 0
+        self.state = self.reader.read()
+
+    def _observe(self, restarted: torch.Tensor) -> None:
+        """Append the present to the history of every world and assemble the observation groups."""
+        s, c = self.state, self.commands.current()
+        angle = 2.0 * math.pi * c.phase
+        present = torch.cat(
+            (
+                s.torso_angular_velocity_t, s.projected_gravity_t, c.velocity_h, c.yaw_rate.unsqueeze(1),
+                c.stand.unsqueeze(1), c.height.unsqueeze(1), self.motions.current().position,
+                s.joint_pos - self._default, s.joint_vel, self._last_action, angle.sin().unsqueeze(1),
+                angle.cos().unsqueeze(1), self.joint_torque(s)[:, self.num_lower :],
+            ),
+            1,
+        )  # fmt: skip
+        present = present * self.history.scale
+        groups = {"privileged": self._privileged(s) * self._critic_scale}
+        if self.cfg.observations.noise.enabled:
+            groups["clean"] = self._clean_history.append(present, restarted)
+            present = present + self._noise * uniform(self.rng, -1.0, 1.0, *present.shape)
+        groups["policy"] = self.history.append(present, restarted)
+        self._observations = TensorDict(groups, batch_size=[self.num_envs])
+
+    def _privileged(self, s: RobotState) -> torch.Tensor:
+        return torch.cat(
+            (quat_from_matrix(s.torso_rotation_w), s.torso_linear_velocity_h, self._hand_force_w.flatten(1)), 1
+        )
+
+
+def heading_yaw(rotation_w: torch.Tensor) -> torch.Tensor:
+    """Yaw (N,) [rad] of rotations (N, 3, 3)."""
+    heading = heading_matrix(rotation_w)
+    return torch.atan2(heading[:, 1, 0], heading[:, 0, 0])
+
+
+__all__ = ["ArmReference", "Command", "H1Env", "H1EnvConfig", "heading_yaw"]

@@ -1,0 +1,113 @@
+"""Observations (paper, appendix B): what each agent sees, term by term, with history."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+
+from cotap.checks import require_range
+from cotap.envs.persistence import Stateful
+
+
+@dataclass
+class NoiseConfig:
+    """Half widths of uniform sensor noise on the actor's observation; the critic never sees it."""
+
+    enabled: bool = False
+    """Whether sensors are noisy."""
+    angular_velocity: float = 0.2
+    """[rad/s]."""
+    gravity: float = 0.05
+    """Unit vector components."""
+    joint_position: float = 0.01
+    """[rad]."""
+    joint_velocity: float = 1.0
+    """[rad/s]."""
+
+
+@dataclass
+class ObservationConfig:
+    """Layout options of the observation."""
+
+    history: int = 5
+    """Steps of history, the present one included."""
+    noise: NoiseConfig = field(default_factory=NoiseConfig)
+
+    def check(self) -> None:
+        """Raise ValueError naming the first field that is out of its range."""
+        require_range("observations.history", self.history, 1, 100)
+        for name in ("angular_velocity", "gravity", "joint_position", "joint_velocity"):
+            require_range(f"observations.noise.{name}", getattr(self.noise, name), 0.0, 100.0)
+
+
+Term = tuple[str, int, float]
+"""Name, width and scale."""
+
+
+def actor_terms(num_joints: int, num_upper: int) -> tuple[Term, ...]:
+    """Terms of one step of the actor's observation, in order."""
+    return (
+        ("torso_angular_velocity", 3, 0.25),
+        ("projected_gravity", 3, 1.0),
+        ("command_velocity", 2, 1.0),
+        ("command_yaw_rate", 1, 1.0),
+        ("command_stand", 1, 1.0),
+        ("command_height", 1, 2.0),
+        ("reference_arm_position", num_upper, 1.0),
+        ("joint_position", num_joints, 1.0),
+        ("joint_velocity", num_joints, 0.05),
+        ("last_action", num_joints, 1.0),
+        ("sin_phase", 1, 1.0),
+        ("cos_phase", 1, 1.0),
+        ("arm_torque", num_upper, 1.0),
+    )
+
+
+def critic_terms(num_hands: int) -> tuple[Term, ...]:
+    """Terms that only the critic sees, for the present step."""
+    return (
+        ("torso_orientation", 4, 1.0),
+        ("torso_linear_velocity", 3, 2.0),
+        *((f"hand_force_{i}", 3, 0.1) for i in range(num_hands)),
+    )
+
+
+class ObservationHistory(Stateful):
+    """Keeps the last steps of every term, laid out term by term and oldest first."""
+
+    STATE = ("buffer",)
+
+    def __init__(self, terms: tuple[Term, ...], num_envs: int, steps: int) -> None:
+        self.terms, self.steps = terms, steps
+        self.width = sum(width for _, width, _ in terms)
+        self.scale = torch.cat([torch.full((width,), scale) for _, width, scale in terms])
+        self.buffer = torch.zeros(num_envs, self.width * steps)
+        self._widths = [width for _, width, _ in terms]
+
+    def append(self, present: torch.Tensor, restarted: torch.Tensor) -> torch.Tensor:
+        """Add `present` (N, width), already scaled; worlds in `restarted` (N,) fill their history with it.
+
+        Returns the new buffer (N, width * steps), which later calls do not change.
+        """
+        pieces: list[torch.Tensor] = []
+        start = 0
+        for width, term in zip(self._widths, present.split(self._widths, 1), strict=True):
+            pieces += (self.buffer[:, start + width : start + width * self.steps], term)
+            start += width * self.steps
+        self.buffer = torch.cat(pieces, 1)
+        if restarted.any():
+            fresh = [t.repeat(1, self.steps) for t in present[restarted].split(self._widths, 1)]
+            self.buffer[restarted] = torch.cat(fresh, 1)
+        return self.buffer
+
+
+def noise_amplitude(terms: tuple[Term, ...], cfg: NoiseConfig) -> torch.Tensor:
+    """Noise half width of each column of one step, scaled as the observation is."""
+    widths = {
+        "torso_angular_velocity": cfg.angular_velocity,
+        "projected_gravity": cfg.gravity,
+        "joint_position": cfg.joint_position,
+        "joint_velocity": cfg.joint_velocity,
+    }
+    return torch.cat([torch.full((width,), widths.get(name, 0.0) * scale) for name, width, scale in terms])

@@ -1,0 +1,32 @@
+"""Saving and loading the tensors that a component carries from step to step."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import torch
+
+from cotap.checks import require_shape
+
+
+class Stateful:
+    """A component whose memory is the tensors named in `STATE`."""
+
+    STATE: ClassVar[tuple[str, ...]] = ()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Copies of the tensors in `STATE`, by name."""
+        return {name: getattr(self, name).clone() for name in self.STATE}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take over what `state_dict` returned. Raises ValueError for another size or a missing name."""
+        if state.keys() != set(self.STATE):
+            raise ValueError(f"{type(self).__name__} expects state {sorted(self.STATE)}, got {sorted(state)}")
+        for name in self.STATE:
+            own: torch.Tensor = getattr(self, name)
+            setattr(self, name, require_shape(f"{type(self).__name__}.{name}", state[name], tuple(own.shape)).clone())
+
+
+def uniform(rng: torch.Generator, low: float, high: float, *shape: int) -> torch.Tensor:
+    """Uniform random numbers in [low, high) of the given shape."""
+    return torch.rand(*shape, generator=rng).mul_(high - low).add_(low)

@@ -1,0 +1,133 @@
+"""What the robot is doing, read from the simulation once a control step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from cotap.compliance.kinematics import ChainPose, SerialChains
+from cotap.robots import RobotSpec
+from cotap.rotations import heading_matrix, matrix_from_quat, rotate, rotate_inverse
+from cotap.sim import Simulation
+
+CONTACT_FORCE_N = 5.0
+"""A foot that carries more than this is in contact."""
+
+
+@dataclass(frozen=True)
+class RobotState:
+    """N worlds. Suffixes name frames: `_w` world, `_t` torso link, `_h` heading (z up, x along the torso's yaw).
+
+    Joints and all that follows from them are current; the four `foot_*` tensors come from sensors and are one
+    physics step older (the simulation's contract).
+    """
+
+    joint_pos: torch.Tensor
+    """(N, J) [rad], in the robot's joint order."""
+    joint_vel: torch.Tensor
+    """(N, J) [rad/s]."""
+    base_rotation_w: torch.Tensor
+    """(N, 3, 3)."""
+    torso_pos_w: torch.Tensor
+    """(N, 3) [m]."""
+    torso_rotation_w: torch.Tensor
+    """(N, 3, 3)."""
+    heading_w: torch.Tensor
+    """(N, 3, 3), heading frame to world."""
+    torso_linear_velocity_h: torch.Tensor
+    """(N, 3) [m/s]."""
+    torso_angular_velocity_t: torch.Tensor
+    """(N, 3) [rad/s]."""
+    yaw_rate: torch.Tensor
+    """(N,) angular velocity about the vertical [rad/s]."""
+    projected_gravity_t: torch.Tensor
+    """(N, 3) unit vector."""
+    arms: ChainPose
+    """Pose of the arms in the torso frame."""
+    foot_force: torch.Tensor
+    """(N, F) normal force [N]."""
+    foot_pos_w: torch.Tensor
+    """(N, F, 3) sole centres [m]."""
+    foot_velocity_w: torch.Tensor
+    """(N, F, 3) [m/s]."""
+    foot_up_w: torch.Tensor
+    """(N, F, 3) the soles' normals."""
+    foot_forward_w: torch.Tensor
+    """(N, F, 3) the feet's forward axes."""
+
+    @property
+    def foot_contact(self) -> torch.Tensor:
+        """(N, F) bool."""
+        return self.foot_force > CONTACT_FORCE_N
+
+    @property
+    def height(self) -> torch.Tensor:
+        """(N,) height of the torso link's origin above the ground [m]."""
+        return self.torso_pos_w[:, 2]
+
+
+def chains_between(spec: RobotSpec, root: str, tips: list[tuple[str, tuple[float, float, float]]]) -> SerialChains:
+    """Kinematic chains from body `root` to points (body, point in its frame), all of equal length."""
+    joint_axes = {j.name: j.axis for j in spec.joints}
+    chains = [spec.chain(body, root) for body, _ in tips]
+    return SerialChains(
+        torch.tensor([[b.pos for b in chain] for chain in chains]),
+        torch.tensor([[b.quat for b in chain] for chain in chains]),
+        torch.tensor([[joint_axes[b.joint or ""] for b in chain] for chain in chains]),
+        torch.tensor([point for _, point in tips]),
+    )
+
+
+class StateReader:
+    """Turns a simulation's raw vectors into a `RobotState`."""
+
+    def __init__(self, spec: RobotSpec, sim: Simulation) -> None:
+        self._sim = sim
+        self.arm_chains = chains_between(spec, spec.torso_body, [(a.hand_body, a.hand_point) for a in spec.arms])
+        self._waist = chains_between(spec, spec.base_body, [(spec.torso_body, (0.0, 0.0, 0.0))])
+        waist = [b.joint or "" for b in spec.chain(spec.torso_body, spec.base_body)]
+        self._waist_ids = spec.indices(waist)
+        self._arm_ids = torch.tensor(spec.indices(spec.upper_joints))
+        self._num_arms = len(spec.arms)
+        names = [f"{foot.side}_foot" for foot in spec.feet]
+        self._foot_sensors = {k: [sim.sensor(f"{n}_{k}") for n in names] for k in ("pos", "vel", "up", "forward")}
+        self._touch = [sim.sensor(f"{n}_touch") for n in names]
+
+    def arm_joints(self, values: torch.Tensor) -> torch.Tensor:
+        """Pick the arms out of (N, J): (N, arms, joints per arm)."""
+        return values[:, self._arm_ids].unflatten(1, (self._num_arms, -1))
+
+    def read(self) -> RobotState:
+        """The state now."""
+        qpos, qvel = self._sim.qpos.float(), self._sim.qvel.float()
+        q, dq = qpos[:, 7:], qvel[:, 6:]
+        base = matrix_from_quat(torch.nn.functional.normalize(qpos[:, 3:7], dim=-1))
+        waist = self._waist.pose(q[:, None, self._waist_ids])
+        rates = waist.axes[:, 0] * dq[:, self._waist_ids, None]  # (N, waist joints, 3), base frame
+        offset = waist.tip[:, 0]
+        angular_b = qvel[:, 3:6] + rates.sum(1)
+        linear_b = torch.linalg.cross(qvel[:, 3:6], offset)
+        linear_b = linear_b + torch.linalg.cross(rates, offset.unsqueeze(1) - waist.anchors[:, 0]).sum(1)
+        torso = base @ waist.rotation[:, 0]
+        heading = heading_matrix(torso)
+        angular_w = rotate(base, angular_b)
+        foot = {k: torch.stack(v, 1) for k, v in self._foot_sensors.items()}
+        return RobotState(
+            joint_pos=q,
+            joint_vel=dq,
+            base_rotation_w=base,
+            torso_pos_w=qpos[:, :3] + rotate(base, offset),
+            torso_rotation_w=torso,
+            heading_w=heading,
+            torso_linear_velocity_h=rotate_inverse(heading, qvel[:, :3] + rotate(base, linear_b)),
+            torso_angular_velocity_t=rotate_inverse(torso, angular_w),
+            yaw_rate=angular_w[:, 2],
+            projected_gravity_t=-torso[:, 2, :],
+            arms=self.arm_chains.pose(self.arm_joints(q)),
+            foot_force=torch.cat(self._touch, 1),
+            foot_pos_w=foot["pos"],
+            foot_velocity_w=foot["vel"],
+            foot_up_w=foot["up"],
+            foot_forward_w=foot["forward"],
+        )

@@ -1,0 +1,12 @@
+"""Robots by name. A new robot is one file that builds a RobotSpec, and one line here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from cotap.robots.h1 import h1
+from cotap.robots.spec import ArmSpec, BodySpec, FootSpec, GeomSpec, JointSpec, RobotSpec
+
+ROBOTS: dict[str, Callable[[], RobotSpec]] = {"h1": h1}
+
+__all__ = ["ROBOTS", "ArmSpec", "BodySpec", "FootSpec", "GeomSpec", "JointSpec", "RobotSpec", "h1"]

@@ -1,0 +1,105 @@
+"""`python -m cotap.train`: train policies from the command line."""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from cotap.checks import require_one_of
+from cotap.configs import BASE_RECIPES, BaseTraining, from_plain, to_plain
+
+SHORTCUTS = {"--num-envs": "--training.env.num-envs", "--iterations": "--training.runner.iterations",
+             "--seed": "--training.seed", "--threads": "--training.threads"}  # fmt: skip
+
+
+@dataclass
+class BaseOptions:
+    """Stage 1: a base policy. Legs follow velocity, yaw rate, height and stand commands; arms follow a reference."""
+
+    run_dir: str = ""
+    """Where the run goes; by default runs/base-DATE-TIME, or the resumed checkpoint's folder."""
+    resume: str = ""
+    """Checkpoint to go on from; its config is the default for every option."""
+    recipe: str = "default"
+    """default, or paper (the paper's networks)."""
+    training: Annotated[BaseTraining, tyro.conf.arg(name="training")] = field(default_factory=BASE_RECIPES["default"])
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Parse, train, report. Returns the exit status: 0, or 2 for bad input."""
+    args = list(sys.argv[1:] if argv is None else argv)
+    if args and not args[0].startswith("-"):
+        stage = args.pop(0)
+    else:
+        stage = "base"
+    try:
+        require_one_of("stage", stage, ("base",))
+        train_base(_parse(args))
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _parse(args: list[str]) -> BaseOptions:
+    """Options on top of the resumed checkpoint's config, or else of the recipe's."""
+    from cotap.agents.checkpoint import load_checkpoint
+
+    args = [SHORTCUTS.get(key, key) + sep + value for key, sep, value in (a.partition("=") for a in args)]
+    first: Any = _peek(args, "--resume")
+    recipe = require_one_of("recipe", _peek(args, "--recipe") or "default", BASE_RECIPES.keys())
+    training = BASE_RECIPES[recipe]()
+    if first:
+        training = from_plain(BaseTraining, load_checkpoint(first)["config"]["training"])
+    return tyro.cli(
+        BaseOptions, args=args, default=BaseOptions(recipe=recipe, training=training), prog="python -m cotap.train base",
+        config=(tyro.conf.OmitArgPrefixes,) if False else (),
+    )  # fmt: skip
+
+
+def _peek(args: list[str], option: str) -> str:
+    for i, arg in enumerate(args):
+        if arg.startswith(option + "="):
+            return arg.partition("=")[2]
+        if arg == option and i + 1 < len(args):
+            return args[i + 1]
+    return ""
+
+
+def train_base(options: BaseOptions) -> Path:
+    """Run stage 1. Returns the run directory."""
+    import torch
+
+    from cotap.agents.runner import DualRunner, check_run_dir
+    from cotap.envs import H1Env
+
+    training = options.training
+    run_dir = Path(options.run_dir or (Path(options.resume).parent if options.resume else _new_run_dir("base")))
+    training.env.seed, training.env.num_threads = training.seed, training.threads
+    training.env.check()
+    training.ppo.check()
+    training.runner.check()
+    check_run_dir(run_dir, resuming=bool(options.resume))
+    if training.threads:
+        torch.set_num_threads(training.threads)
+    torch.manual_seed(training.seed)
+    config = {"stage": "base", "training": to_plain(training)}
+    runner = DualRunner(H1Env(training.env), training.runner, training.ppo, run_dir, config, training.device)
+    if options.resume:
+        runner.load(options.resume)
+    runner.learn(init_at_random_ep_len=True)
+    print(f"{runner.current_learning_iteration} iterations, {runner.wall_seconds:.0f} s: {run_dir}")
+    return run_dir
+
+
+def _new_run_dir(stage: str) -> Path:
+    return Path("runs") / time.strftime(f"{stage}-%Y%m%d-%H%M%S")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
