@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import platform
+import subprocess
 import sys
 import time
 from dataclasses import dataclass, field
@@ -10,16 +13,19 @@ from typing import Annotated, Any
 
 import tyro
 
+from cotap import __version__
 from cotap.checks import require_one_of
 from cotap.configs import BASE_RECIPES, BaseTraining, from_plain, to_plain
 
-SHORTCUTS = {"--num-envs": "--training.env.num-envs", "--iterations": "--training.runner.iterations",
-             "--seed": "--training.seed", "--threads": "--training.threads"}  # fmt: skip
+SHORTCUTS = {"--num-envs": "--env.num-envs", "--iterations": "--runner.iterations"}
 
 
 @dataclass
 class BaseOptions:
-    """Stage 1: a base policy. Legs follow velocity, yaw rate, height and stand commands; arms follow a reference."""
+    """Stage 1: a base policy. Legs follow velocity, yaw rate, height and stand commands; arms follow a reference.
+
+    `--num-envs` and `--iterations` are short for `--env.num-envs` and `--runner.iterations`.
+    """
 
     run_dir: str = ""
     """Where the run goes; by default runs/base-DATE-TIME, or the resumed checkpoint's folder."""
@@ -27,19 +33,19 @@ class BaseOptions:
     """Checkpoint to go on from; its config is the default for every option."""
     recipe: str = "default"
     """default, or paper (the paper's networks)."""
-    training: Annotated[BaseTraining, tyro.conf.arg(name="training")] = field(default_factory=BASE_RECIPES["default"])
+    command: tyro.conf.Suppress[str] = ""
+    training: Annotated[BaseTraining, tyro.conf.arg(name="")] = field(default_factory=BASE_RECIPES["default"])
 
 
 def main(argv: list[str] | None = None) -> int:
     """Parse, train, report. Returns the exit status: 0, or 2 for bad input."""
     args = list(sys.argv[1:] if argv is None else argv)
-    if args and not args[0].startswith("-"):
-        stage = args.pop(0)
-    else:
-        stage = "base"
+    stage = args.pop(0) if args and not args[0].startswith("-") else "base"
     try:
         require_one_of("stage", stage, ("base",))
-        train_base(_parse(args))
+        options = _parse(args)
+        options.command = " ".join(["python -m cotap.train", stage, *args])
+        train_base(options)
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -56,10 +62,8 @@ def _parse(args: list[str]) -> BaseOptions:
     training = BASE_RECIPES[recipe]()
     if first:
         training = from_plain(BaseTraining, load_checkpoint(first)["config"]["training"])
-    return tyro.cli(
-        BaseOptions, args=args, default=BaseOptions(recipe=recipe, training=training), prog="python -m cotap.train base",
-        config=(tyro.conf.OmitArgPrefixes,) if False else (),
-    )  # fmt: skip
+    default = BaseOptions(recipe=recipe, training=training)
+    return tyro.cli(BaseOptions, args=args, default=default, prog="python -m cotap.train base")
 
 
 def _peek(args: list[str], option: str) -> str:
@@ -88,13 +92,26 @@ def train_base(options: BaseOptions) -> Path:
     if training.threads:
         torch.set_num_threads(training.threads)
     torch.manual_seed(training.seed)
-    config = {"stage": "base", "training": to_plain(training)}
+    config = {"stage": "base", "training": to_plain(training), **_provenance(options.command)}
     runner = DualRunner(H1Env(training.env), training.runner, training.ppo, run_dir, config, training.device)
     if options.resume:
         runner.load(options.resume)
     runner.learn(init_at_random_ep_len=True)
     print(f"{runner.current_learning_iteration} iterations, {runner.wall_seconds:.0f} s: {run_dir}")
     return run_dir
+
+
+def _provenance(command: str) -> dict[str, str]:
+    """What else a run should remember: the code it ran, the command, the machine."""
+    try:
+        git = ["git", "-C", str(Path(__file__).parent)]
+        commit = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True).stdout.strip()
+        dirty = subprocess.run([*git, "status", "--porcelain", "."], capture_output=True, text=True, check=True).stdout
+        commit += " with local changes" if dirty.strip() else ""
+    except (OSError, subprocess.CalledProcessError):
+        commit = f"cotap {__version__}"
+    machine = f"{platform.machine()}, {os.cpu_count()} processors, Python {platform.python_version()}"
+    return {"commit": commit, "command": command, "machine": machine}
 
 
 def _new_run_dir(stage: str) -> Path:

@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, cast
 
 import torch
 from rsl_rl.modules import MLP, EmpiricalNormalization
+from tensordict import TensorDict
 from torch import nn
 
 Observations = dict[str, torch.Tensor]
+
+
+def as_dict(observations: TensorDict, device: torch.device | str = "cpu") -> Observations:
+    """Observation groups as a plain dict on `device`."""
+    return {group: cast(torch.Tensor, value).to(device) for group, value in observations.items()}
 
 
 @dataclass(frozen=True)
@@ -20,6 +27,14 @@ class AgentLayout:
     """Observation groups that `actor` and `critic` read."""
     action_slices: dict[str, slice]
     """Each agent's share of the action vector."""
+
+    def to_plain(self) -> dict[str, Any]:
+        """As plain data, for checkpoints."""
+        return {
+            "observation_widths": dict(self.observation_widths),
+            "obs_groups": {k: list(v) for k, v in self.obs_groups.items()},
+            "action_slices": {k: [v.start, v.stop] for k, v in self.action_slices.items()},
+        }
 
     @property
     def num_actions(self) -> int:
@@ -36,7 +51,7 @@ class Head(nn.Module):
     def __init__(self, inputs: int, outputs: int, hidden: tuple[int, ...], output_gain: float) -> None:
         super().__init__()
         self.mlp = MLP(inputs, outputs, hidden, "swish")
-        last = self.mlp[-1]
+        last = cast(nn.Linear, self.mlp[-1])
         nn.init.orthogonal_(last.weight, gain=output_gain)
         nn.init.zeros_(last.bias)
 
@@ -73,7 +88,7 @@ class DualActorCritic(nn.Module):
     def update_normalizers(self, observations: Observations) -> None:
         """Learn from a batch of raw observations."""
         for group, normalizer in self.normalizers.items():
-            normalizer.update(observations[group])
+            cast(EmpiricalNormalization, normalizer).update(observations[group])
 
     def read(self, reader: str, normalized: Observations) -> torch.Tensor:
         """Input (N, width) of the `actor` or `critic`."""
@@ -86,5 +101,6 @@ class DualActorCritic(nn.Module):
         return torch.cat([self.actors[name](x) for name in self.layout.action_slices], -1)
 
     def forward(self, observations: Observations) -> torch.Tensor:
-        """Deterministic action (N, A) of raw observations: what is deployed."""
-        return self.mean_action(self.normalize(observations))
+        """Deterministic action (N, A) of raw observations: what is deployed. Needs only what actors read."""
+        groups = self.layout.obs_groups["actor"]
+        return self.mean_action({g: self.normalizers[g](observations[g]) for g in groups})

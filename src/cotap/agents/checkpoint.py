@@ -22,13 +22,13 @@ class CheckpointError(ValueError):
     """A file that cannot be used as a checkpoint; the message names it and says why."""
 
 
-def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
+def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     """Let `write` fill a temporary file beside `path`, then rename it: readers see the old file or the new, whole.
 
     Raises:
         OSError: the disk is full or the folder not writable; nothing is left behind, and an old file is untouched.
     """
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent)
     os.close(handle)
     temporary = Path(name)
     try:

@@ -48,7 +48,7 @@ class DualPPOConfig:
     """Weight of the value loss."""
     learning_rate: float = 1e-3
     """At the start; then adapted to `desired_kl`, per agent."""
-    desired_kl: float = 0.01
+    desired_kl: float = 0.015
     """Change of the policy per update that the learning rate aims at [nat]."""
     max_grad_norm: float = 1.0
     """Gradient norm above which gradients are scaled down, per network."""
@@ -122,12 +122,19 @@ class DualPPO:
                 f"ppo.mini_batches must be at most num_envs * steps = {num_envs * cfg.steps}, got {cfg.mini_batches}"
             )
         t, n, g, a = cfg.steps, num_envs, len(self.names), layout.num_actions
+
+        def buffer(width: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+            return torch.zeros(t, n, width, dtype=dtype, device=device)
+
         self.rollout = Rollout(
-            {k: torch.zeros(t, n, layout.observation_widths[k], dtype=self.dtype, device=device)
-             for k in self.model.normalizers},
-            *(torch.zeros(t, n, width, device=device) for width in (a, a, g, g, g)),
-            torch.zeros(t, n, 1, dtype=torch.bool, device=device),
-        )  # fmt: skip
+            observations={k: buffer(layout.observation_widths[k], self.dtype) for k in self.model.normalizers},
+            actions=buffer(a),
+            means=buffer(a),
+            log_probs=buffer(g),
+            values=buffer(g),
+            rewards=buffer(g),
+            dones=buffer(1, torch.bool),
+        )
         self._step = 0
 
     def _autocast(self) -> torch.autocast:

@@ -17,7 +17,7 @@ from rsl_rl.runners import OnPolicyRunner
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-from cotap.agents.actors import AgentLayout
+from cotap.agents.actors import AgentLayout, as_dict
 from cotap.agents.checkpoint import CheckpointError, load_checkpoint, require_layout, save_checkpoint, write_json
 from cotap.agents.dual_ppo import DualPPO, DualPPOConfig
 from cotap.checks import require_positive_int
@@ -155,9 +155,7 @@ class DualRunner(OnPolicyRunner):
                 if content["env"]:
                     save_checkpoint(older, content | {"env": {}})
 
-    def load(
-        self, path: str, load_cfg: dict | None = None, strict: bool = True, map_location: str | None = None
-    ) -> dict:
+    def load(self, path: str, *_: Any, map_location: str | None = None, **__: Any) -> dict:
         """Load a checkpoint. What it lacks (a shipped one has no optimiser or simulator states) starts afresh.
 
         Raises:
@@ -192,6 +190,7 @@ class DualRunner(OnPolicyRunner):
         return {
             "kind": self.config.get("stage", "base"),
             "layout": json.loads(json.dumps(env.layout())),
+            "agents": self.alg.layout.to_plain(),
             "config": self.config,
             "model": self.alg.model.state_dict(),
             "learner": self.alg.state_dict(),
@@ -203,13 +202,13 @@ class DualRunner(OnPolicyRunner):
         }
 
     def _observations(self) -> dict[str, torch.Tensor]:
-        return {k: v.to(self.device) for k, v in self.env.get_observations().items()}
+        return as_dict(self.env.get_observations(), self.device)
 
     @contextmanager
     def _signals(self) -> Iterator[None]:
         """Ctrl-C and SIGTERM end the run after the present iteration, with a checkpoint; a second one at once."""
 
-        def stop(number: int, _frame: Any) -> None:
+        def stop(_number: int, _frame: Any) -> None:
             if self._stop:
                 raise KeyboardInterrupt
             self._stop = True

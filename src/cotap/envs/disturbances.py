@@ -97,26 +97,40 @@ class AssistConfig:
 
     enabled: bool = False
     """Whether to assist; training switches it on."""
-    full_samples: float = 2e6
+    full_samples: float = 1.5e6
     """Environment steps, over all worlds, with full assistance."""
-    end_samples: float = 9e6
+    end_samples: float = 7e6
     """Environment steps after which there is none."""
     upright_stiffness: float = 400.0
     """[Nm/rad]."""
     upright_damping: float = 40.0
     """[Nms/rad]."""
+    yaw_gain: float = 50.0
+    """Turning torque towards the commanded yaw rate [Nm per rad/s]."""
     velocity_gain: float = 300.0
     """Horizontal pull towards the commanded velocity [N per m/s]."""
     force_limit: float = 150.0
     """Largest pull [N]."""
-    weight_share: float = 0.25
+    weight_share: float = 0.3
     """Share of the robot's weight that is lifted."""
+    height_stiffness: float = 2000.0
+    """Lift added when the base is below its commanded height [N/m]."""
+    height_damping: float = 200.0
+    """[Ns/m]."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
         require_range("assist.full_samples", self.full_samples, 0.0, self.end_samples)
         require_range("assist.weight_share", self.weight_share, 0.0, 1.0)
-        for name in ("upright_stiffness", "upright_damping", "velocity_gain", "force_limit"):
+        for name in (
+            "upright_stiffness",
+            "upright_damping",
+            "yaw_gain",
+            "velocity_gain",
+            "force_limit",
+            "height_stiffness",
+            "height_damping",
+        ):
             require_range(f"assist.{name}", getattr(self, name), 0.0, 1e6)
 
     def share(self, samples: float) -> float:
@@ -130,7 +144,7 @@ class AssistConfig:
 
 def assist_wrench(
     cfg: AssistConfig, weight_n: float, up_w: torch.Tensor, angular_velocity_w: torch.Tensor,
-    velocity_error_w: torch.Tensor,
+    velocity_error_w: torch.Tensor, yaw_rate_error: torch.Tensor, height_error: torch.Tensor, climb: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
     """Force and torque (N, 3) on the base, world frame, at full assistance.
 
@@ -140,12 +154,19 @@ def assist_wrench(
         up_w: (N, 3) the base's z axis.
         angular_velocity_w: (N, 3) [rad/s].
         velocity_error_w: (N, 2) commanded minus actual horizontal velocity [m/s].
+        yaw_rate_error: (N,) commanded minus actual yaw rate [rad/s].
+        height_error: (N,) commanded minus actual height [m].
+        climb: (N,) vertical velocity [m/s].
     """
     vertical = torch.tensor([0.0, 0.0, 1.0]).expand_as(up_w)
     upright = cfg.upright_stiffness * torch.linalg.cross(up_w, vertical)
-    tilt_rate = angular_velocity_w * torch.tensor([1.0, 1.0, 0.0])
+    damping = cfg.upright_damping * angular_velocity_w[:, :2]
+    turn = cfg.yaw_gain * yaw_rate_error
     pull = cfg.velocity_gain * velocity_error_w
     size = pull.norm(dim=1, keepdim=True).clamp_min(1e-6)
     pull = pull * (cfg.force_limit / size).clamp_max(1.0)
-    lift = torch.full_like(pull[:, :1], cfg.weight_share * weight_n)
-    return torch.cat((pull, lift), 1), upright - cfg.upright_damping * tilt_rate
+    # Like a gantry: it lifts, and never pushes down.
+    spring = cfg.height_stiffness * height_error - cfg.height_damping * climb
+    lift = (cfg.weight_share * weight_n + spring).clamp(0.0, weight_n).unsqueeze(1)
+    torque = torch.cat((upright[:, :2] - damping, (upright[:, 2] + turn).unsqueeze(1)), 1)
+    return torch.cat((pull, lift), 1), torque

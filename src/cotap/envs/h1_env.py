@@ -12,9 +12,9 @@ from tensordict import TensorDict
 
 from cotap.checks import require_all_finite, require_one_of, require_positive_int, require_range, require_shape
 from cotap.compliance.kinematics import ChainPose
-from cotap.envs.commands import Command, CommandConfig, CommandSource, desired_contact, swing_progress
+from cotap.envs.commands import CommandConfig, CommandSource, desired_contact, swing_progress
 from cotap.envs.disturbances import AssistConfig, HandForceConfig, HandForces, assist_wrench
-from cotap.envs.motions import ArmReference, MotionConfig, MotionGenerator
+from cotap.envs.motions import MotionConfig, MotionGenerator
 from cotap.envs.observations import (
     ObservationConfig,
     ObservationHistory,
@@ -29,8 +29,8 @@ from cotap.envs.state import RobotState, StateReader
 from cotap.envs.terminations import TerminationConfig, diverged, fallen
 from cotap.robots import ROBOTS
 from cotap.robots.mjcf import COLLISIONS, build_model
-from cotap.rotations import heading_matrix, quat_about_z, quat_from_matrix, rotate
-from cotap.sim import DelayedTargets, Simulation
+from cotap.rotations import quat_about_z, quat_from_matrix, rotate
+from cotap.sim import DelayedTargets, Simulation, Snapshot
 
 GRAVITY = 9.81
 
@@ -41,6 +41,8 @@ class ActionConfig:
 
     lower_scale: float = 0.25
     """Radians per unit of lower action, added to the default pose."""
+    step_flexion: float = 1.0
+    """Share of the stepping motion that the gait clock feeds forward to the legs; 0 leaves all to the policy."""
     upper_scale: float = 0.1
     """Radians per unit of upper action, added to the reference (residual) or to the default pose (absolute)."""
     upper_mode: str = "residual"
@@ -51,6 +53,7 @@ class ActionConfig:
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
         require_range("actions.lower_scale", self.lower_scale, 0.0, 10.0)
+        require_range("actions.step_flexion", self.step_flexion, 0.0, 2.0)
         require_range("actions.upper_scale", self.upper_scale, 0.0, 10.0)
         require_range("actions.clip", self.clip, 1e-3, 1e6)
         require_one_of("actions.upper_mode", self.upper_mode, ("residual", "absolute"))
@@ -111,9 +114,9 @@ class H1EnvConfig:
 class H1Env(VecEnv):
     """N robots that walk with their legs and follow a reference with their arms.
 
-    One step, in order: actions to targets; physics, forces held and targets arriving late; state read once; clocks of
-    commands, motion and forces advance; falls, divergence and time-outs found; rewards from the record of the step;
-    ended worlds restart; observations. After a step, everything in an observation is current, except that worlds'
+    One step, in order: reference motion advances, actions to targets; physics, forces held and targets arriving late;
+    state read once; clocks of commands and forces advance; falls, divergence and time-outs found; rewards from the
+    record of the step; ended worlds restart; observations. After a step, everything in an observation is current;
     foot sensors (rewards only) lag one physics step.
 
     `action_slices` and `reward_groups` tell agents, by name, which actions and which reward are theirs; `step` returns
@@ -123,6 +126,7 @@ class H1Env(VecEnv):
         ValueError: a field of the config is out of its range.
     """
 
+    cfg: H1EnvConfig  # pyright: ignore[reportIncompatibleVariableOverride]
     reward_groups = ("lower", "upper")
 
     def __init__(self, cfg: H1EnvConfig | None = None) -> None:
@@ -151,6 +155,9 @@ class H1Env(VecEnv):
         self._sideways = tuple(
             i for i, j in enumerate(joints[: self.num_lower]) if j.mirror_sign < 0.0
         )  # yaw and roll joints
+        self._flexion_joints = torch.tensor([spec.indices([n for n, _ in f.flexion]) for f in spec.feet])
+        flexion = torch.tensor([[angle for _, angle in f.flexion] for f in spec.feet])
+        self._flexion = cfg.actions.step_flexion * flexion
         self._action_scale = torch.full((self.num_actions,), cfg.actions.lower_scale)
         self._action_scale[self.num_lower :] = cfg.actions.upper_scale
 
@@ -237,6 +244,8 @@ class H1Env(VecEnv):
         require_shape("actions", actions, (self.num_envs, self.num_actions))
         require_all_finite("actions", actions)
         action = actions.clamp(-self.cfg.actions.clip, self.cfg.actions.clip)
+        # The reference moves first: arms are sent where it will be, and judged against that, at the end of the step.
+        self.motions.step(self.rng)
         self.targets.send(self.target_from_action(action))
         velocity_before = self.state.joint_vel
         self._apply_forces()
@@ -247,7 +256,6 @@ class H1Env(VecEnv):
         self.samples += self.num_envs
         self.episode_length_buf += 1
         self.commands.step(self.rng)
-        self.motions.step(self.rng)
         self.hand_forces.step(self.rng)
 
         fell = fallen(self.cfg.terminations, self.state.height, self.state.projected_gravity_t) | bad
@@ -266,8 +274,11 @@ class H1Env(VecEnv):
         return self._observations, rewards.sum(1), done, extras
 
     def target_from_action(self, action: torch.Tensor) -> torch.Tensor:
-        """Joint targets (N, J) [rad] of actions (N, J), for the present arm reference."""
+        """Joint targets (N, J) [rad] of actions (N, J), for the present gait phase and arm reference."""
         target = self._default + self._action_scale * action
+        swing = swing_progress(self.commands.current().phase, len(self.spec.feet))
+        lift = torch.sin(torch.pi * swing).square()
+        target[:, self._flexion_joints] += lift.unsqueeze(2) * self._flexion
         if self.cfg.actions.upper_mode == "residual":
             upper = slice(self.num_lower, None)
             target[:, upper] += self.motions.current().position - self._default[upper]
@@ -293,8 +304,6 @@ class H1Env(VecEnv):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on exactly where `state_dict` was taken. Raises ValueError for another number of worlds."""
-        from cotap.sim import Snapshot
-
         self.sim.restore(Snapshot(**state["sim"]))
         for name, part in self._parts().items():
             part.load_state_dict(state["parts"][name])
@@ -340,6 +349,7 @@ class H1Env(VecEnv):
             force, torque = assist_wrench(
                 self.cfg.assist, self._weight_n, s.torso_rotation_w[:, :, 2],
                 rotate(s.torso_rotation_w, s.torso_angular_velocity_t), rotate(s.heading_w, error_h)[:, :2],
+                command.yaw_rate - s.yaw_rate, command.height - s.height, s.torso_linear_velocity_h[:, 2],
             )  # fmt: skip
             self.sim.xfrc[:, self._base_body] = share * torch.cat((force, torque), 1).double()
 
@@ -479,12 +489,3 @@ class H1Env(VecEnv):
         return torch.cat(
             (quat_from_matrix(s.torso_rotation_w), s.torso_linear_velocity_h, self._hand_force_w.flatten(1)), 1
         )
-
-
-def heading_yaw(rotation_w: torch.Tensor) -> torch.Tensor:
-    """Yaw (N,) [rad] of rotations (N, 3, 3)."""
-    heading = heading_matrix(rotation_w)
-    return torch.atan2(heading[:, 1, 0], heading[:, 0, 0])
-
-
-__all__ = ["ArmReference", "Command", "H1Env", "H1EnvConfig", "heading_yaw"]

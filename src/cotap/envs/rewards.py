@@ -68,8 +68,8 @@ class LowerRewards:
     upright: float = -3.0
     vertical_velocity: float = -0.5
     roll_pitch_rate: float = -0.05
-    contact_schedule: float = 0.5
-    swing_height: float = -40.0
+    contact_schedule: float = 1.0
+    swing_height: float = -15.0
     foot_slip: float = -0.3
     foot_flat: float = -0.3
     foot_yaw: float = -0.5
@@ -151,9 +151,9 @@ def swing_clearance(swing: torch.Tensor, peak_m: float = 0.10) -> torch.Tensor:
 
 
 def swing_height(s: StepRecord) -> torch.Tensor:
-    """Squared error of the swinging soles' height."""
+    """Error of the swinging soles' height [m]; linear, so that the first centimetre is worth as much as the last."""
     error = s.state.foot_pos_w[:, :, 2] - swing_clearance(s.swing)
-    return (error.square() * ~s.desired_contact).sum(1)
+    return (error.abs() * ~s.desired_contact).sum(1)
 
 
 def foot_slip(s: StepRecord) -> torch.Tensor:

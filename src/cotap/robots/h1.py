@@ -133,7 +133,15 @@ def h1() -> RobotSpec:
             ArmSpec(s, tuple(f"{s}_{j}" for j in _ARM), f"{s}_elbow_link", (0.3, 0.0, 0.0), f"{s}_elbow_link")
             for s in sides
         ),
-        feet=tuple(FootSpec(s, f"{s}_ankle_link", (0.05, 0.0, -0.07)) for s in sides),
+        feet=tuple(
+            FootSpec(
+                s,
+                f"{s}_ankle_link",
+                (0.05, 0.0, -0.07),
+                ((f"{s}_hip_pitch", -0.35), (f"{s}_knee", 0.7), (f"{s}_ankle", -0.35)),
+            )
+            for s in sides
+        ),
         joint_damping=facts["joint_damping"],
         joint_armature=facts["joint_armature"],
         nominal_height_m=1.028,

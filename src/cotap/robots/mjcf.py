@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+# MuJoCo's extension module has no type stubs.
+# pyright: reportAttributeAccessIssue=false
 import mujoco
 
 from cotap.robots.spec import BodySpec, GeomSpec, RobotSpec
@@ -42,6 +44,7 @@ def build_mjspec(spec: RobotSpec, collision: str = "feet", timestep_s: float = 0
         raise ValueError(f"collision {collision!r} is unknown; known: {', '.join(COLLISIONS)}")
     mj = mujoco.MjSpec()
     mj.modelname = spec.name
+    mj.compiler.degree = False
     mj.option.timestep = timestep_s
     mj.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     # MuJoCo would silently restart a world whose state is not finite; cotap ends its episode and counts it instead.

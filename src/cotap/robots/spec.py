@@ -72,11 +72,14 @@ class ArmSpec:
 
 @dataclass(frozen=True)
 class FootSpec:
-    """A foot: the body that touches the ground and the centre of its sole in that body's frame."""
+    """A foot: the body that touches the ground, the centre of its sole, and how its leg lifts it."""
 
     side: str
     body: str
     sole: Vec3
+    """In `body`'s frame [m]."""
+    flexion: tuple[tuple[str, float], ...]
+    """Joints and angles [rad], relative to the default pose, that lift the sole straight up by a step's height."""
 
 
 @dataclass(frozen=True)

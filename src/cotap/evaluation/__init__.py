@@ -1,0 +1,1 @@
+"""Batched evaluation: protocols as data, rollouts, metrics on arrays, reports."""

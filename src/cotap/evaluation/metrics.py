@@ -1,0 +1,122 @@
+"""Measures, computed from recorded arrays only, per world; then mean, deviation and bootstrap interval over worlds."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+
+from cotap.evaluation.rollout import Trajectory
+
+
+def masked_mean(values: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+    """Mean over time (dim 0) of `values` (T, N) where `mask` (T, N); NaN for a world with no such step, (N,)."""
+    count = mask.sum(0)
+    total = torch.where(mask, values, torch.zeros_like(values)).sum(0)
+    return torch.where(count > 0, total / count.clamp_min(1), torch.full_like(total, math.nan))
+
+
+def moving_average(values: torch.Tensor, steps: int) -> torch.Tensor:
+    """Mean of the last `steps` steps at every step (T, ...); of fewer at the beginning."""
+    total = values.double().cumsum(0)
+    shifted = torch.cat((torch.zeros_like(total[:steps]), total[:-steps])) if steps < len(total) else 0.0
+    count = torch.arange(1, len(total) + 1, dtype=torch.float64).clamp_max(steps)
+    return ((total - shifted) / count.reshape(-1, *[1] * (values.dim() - 1))).to(values.dtype)
+
+
+def steps_since_change(values: torch.Tensor) -> torch.Tensor:
+    """Steps since `values` (T, N, C) last changed, (T, N); counts from the start of the record."""
+    changed = torch.zeros(values.shape[:2], dtype=torch.bool)
+    changed[1:] = (values[1:] != values[:-1]).any(-1)
+    index = torch.arange(values.shape[0]).unsqueeze(1)
+    return index - torch.where(changed, index, torch.zeros_like(index)).cummax(0).values
+
+
+def settled(trajectory: Trajectory, settle_s: float) -> torch.Tensor:
+    """(T, N) bool: on its feet, and under one command for longer than `settle_s`."""
+    command = torch.cat((trajectory.command, trajectory.stand.float().unsqueeze(2)), 2)
+    return (steps_since_change(command) >= round(settle_s / trajectory.dt)) & trajectory.alive()
+
+
+def slope(commanded: torch.Tensor, measured: torch.Tensor, mask: torch.Tensor) -> float:
+    """Least-squares slope, with intercept, of measured against commanded over all samples in `mask`."""
+    x, y = commanded[mask].double(), measured[mask].double()
+    if x.numel() < 2 or float(x.var()) < 1e-9:
+        return math.nan
+    x = x - x.mean()
+    return float((x * (y - y.mean())).sum() / x.square().sum())
+
+
+def swing_heights(foot_height: torch.Tensor, contact: torch.Tensor, mask: torch.Tensor, min_steps: int) -> torch.Tensor:
+    """Mean peak height (N,) of the feet over swings of at least `min_steps` that end inside `mask` (T, N) [m].
+
+    A swing is a stretch without contact; shorter stretches than `min_steps` are chatter. NaN for a world with none.
+    """
+    peak = torch.zeros(foot_height.shape[1:])
+    length = torch.zeros(foot_height.shape[1:])
+    total, count = torch.zeros_like(peak), torch.zeros_like(peak)
+    for height, touching, counted in zip(foot_height, contact, mask, strict=True):
+        landed = touching & (length >= min_steps) & counted.unsqueeze(1)
+        total += torch.where(landed, peak, torch.zeros_like(peak))
+        count += landed.float()
+        peak = torch.where(touching, torch.zeros_like(peak), torch.maximum(peak, height))
+        length = torch.where(touching, torch.zeros_like(length), length + 1)
+    return torch.where(count.sum(1) > 0, total.sum(1) / count.sum(1).clamp_min(1), torch.full((len(total),), math.nan))
+
+
+def tracking_measures(t: Trajectory, gait_period_s: float, settle_s: float = 1.0) -> dict[str, torch.Tensor]:
+    """Velocity-tracking measures per world, (N,) each; NaN where a world has nothing to measure.
+
+    Errors are taken once a command has held for `settle_s`; `_gait` errors use velocities averaged over the last gait
+    period, all of it after the command's change.
+    """
+    period = round(gait_period_s / t.dt)
+    ok = settled(t, settle_s)
+    ok_gait = settled(t, max(settle_s, gait_period_s))
+    error = t.velocity - t.command
+    error_gait = moving_average(t.velocity, period) - t.command
+    walking = ~t.stand
+    contact = t.foot_contact & ok.unsqueeze(2)
+    slip = torch.where(contact, t.foot_speed, torch.zeros_like(t.foot_speed)).sum((0, 2)) / contact.sum(
+        (0, 2)
+    ).clamp_min(1)
+    drift = moving_average(t.velocity, period)[..., :2].norm(dim=2)
+    return {
+        "e_lin": masked_mean(error[..., :2].norm(dim=2), ok),
+        "e_lin_gait": masked_mean(error_gait[..., :2].norm(dim=2), ok_gait),
+        "e_yaw": masked_mean(error[..., 2].abs(), ok),
+        "e_yaw_gait": masked_mean(error_gait[..., 2].abs(), ok_gait),
+        "e_height": masked_mean((t.height - t.height_command).abs(), ok),
+        "e_upper": masked_mean(t.arm_error.norm(dim=2), t.alive()),
+        "e_ee": masked_mean(t.hand_error.mean(2), t.alive()),
+        "j_upper": masked_mean(t.arm_torque.norm(dim=2), t.alive()),
+        "stand_drift": masked_mean(drift, ok_gait & t.stand),
+        "foot_slip": torch.where(contact.any(2).any(0), slip, torch.full_like(slip, math.nan)),
+        "swing_height": swing_heights(t.foot_height, t.foot_contact, ok & walking, round(0.1 / t.dt)),
+        "fall_fraction": t.fell.any(0).float(),
+        "episode_length_fraction": t.alive().float().mean(0),
+    }
+
+
+def tracking_slopes(t: Trajectory, gait_period_s: float, settle_s: float = 1.0) -> dict[str, float]:
+    """Slopes of measured (gait-averaged) against commanded velocity while walking, over all worlds."""
+    measured = moving_average(t.velocity, round(gait_period_s / t.dt))
+    ok = settled(t, max(settle_s, gait_period_s)) & ~t.stand
+    return {f"slope_{name}": slope(t.command[..., i], measured[..., i], ok) for i, name in enumerate(("x", "y", "yaw"))}
+
+
+def summarize(values: torch.Tensor, seed: int = 0, resamples: int = 1000) -> dict[str, Any]:
+    """Mean, standard deviation and bootstrap 95 % interval of the mean over worlds; NaN worlds are left out.
+
+    Where nothing could be measured the numbers are null and `reason` says so.
+    """
+    finite = values[torch.isfinite(values)].double()
+    n = finite.numel()
+    if n == 0:
+        return {"mean": None, "std": None, "ci95": None, "reason": "no world had anything to measure"}
+    rng = torch.Generator().manual_seed(seed)
+    means = torch.stack([finite[torch.randint(0, n, (n,), generator=rng)].mean() for _ in range(resamples)])
+    low, high = torch.quantile(means, torch.tensor([0.025, 0.975], dtype=torch.float64)).tolist()
+    std = float(finite.std()) if n > 1 else 0.0
+    return {"mean": float(finite.mean()), "std": std, "ci95": [low, high]}

@@ -1,0 +1,57 @@
+"""Policies from checkpoints, the shipped ones by name."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from cotap.agents.actors import AgentLayout, DualActorCritic
+from cotap.agents.checkpoint import CheckpointError, load_checkpoint
+from cotap.checks import require_one_of
+
+SHIPPED = {"base": "base.pt"}
+
+
+def shipped_checkpoint(stage: str = "base") -> Path:
+    """Path of the checkpoint that comes with the package. Raises ValueError for an unknown stage."""
+    require_one_of("stage", stage, SHIPPED.keys())
+    return Path(str(files("cotap").joinpath("checkpoints", SHIPPED[stage])))
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A trained policy, in float32, with what it was trained for."""
+
+    model: DualActorCritic
+    layout: dict[str, Any]
+    config: dict[str, Any]
+    stage: str
+
+    @torch.no_grad()
+    def __call__(self, observations: dict[str, torch.Tensor]) -> torch.Tensor:
+        """Deterministic actions (N, A) of raw observations."""
+        return self.model(observations)
+
+
+def load_policy(path: Path | str) -> Policy:
+    """Load a checkpoint's networks for use.
+
+    Raises:
+        CheckpointError: the file cannot be used.
+    """
+    content = load_checkpoint(path)
+    layout, weights = content["layout"], content["model"]
+    agents = content["agents"]
+    slices = {name: slice(*bounds) for name, bounds in agents["action_slices"].items()}
+    hidden = tuple(content["config"]["training"]["ppo"]["hidden"])
+    model = DualActorCritic(AgentLayout(agents["observation_widths"], agents["obs_groups"], slices), hidden, 1.0)
+    try:
+        model.load_state_dict(weights)
+    except RuntimeError as error:
+        raise CheckpointError(f"checkpoint {str(path)!r} has networks that do not fit its config: {error}") from error
+    model.eval()
+    return Policy(model, layout, content["config"], content["kind"])

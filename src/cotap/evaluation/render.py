@@ -1,0 +1,121 @@
+"""Pictures and videos of recorded motion."""
+
+from __future__ import annotations
+
+# MuJoCo's extension module has no type stubs.
+# pyright: reportAttributeAccessIssue=false
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import torch
+
+from cotap.agents.actors import as_dict
+from cotap.agents.checkpoint import write_atomically
+from cotap.envs import H1Env, H1EnvConfig
+from cotap.evaluation.rollout import PolicyFunction
+from cotap.robots import RobotSpec
+from cotap.robots.mjcf import build_model
+
+# Seconds, forward velocity, sideways velocity, yaw rate, stand, height offset.
+TOUR = (
+    (2.0, 0.0, 0.0, 0.0, True, 0.0),
+    (4.0, 0.8, 0.0, 0.0, False, 0.0),
+    (3.0, 0.5, 0.0, 0.7, False, 0.0),
+    (3.0, 0.0, 0.4, 0.0, False, 0.0),
+    (3.0, -0.5, 0.0, 0.0, False, 0.0),
+    (2.0, 0.0, 0.0, 0.0, True, 0.0),
+    (3.0, 0.0, 0.0, 0.0, True, -0.2),
+)
+"""A short tour of everything that the base policy is asked to do."""
+
+
+class RenderingUnavailable(OSError):
+    """This machine cannot render; the message says how to make it able."""
+
+
+def open_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Renderer:
+    """An off-screen renderer.
+
+    Raises:
+        RenderingUnavailable: there is no OpenGL to be had.
+    """
+    try:
+        return mujoco.Renderer(model, height, width)
+    except Exception as error:  # OpenGL back ends raise their own kinds; any of them means no pictures
+        raise RenderingUnavailable(
+            f"cannot render here ({str(error).splitlines()[0]}). Set MUJOCO_GL=egl on a machine with a GPU driver, or "
+            "install OSMesa (Debian, Ubuntu: apt-get install libosmesa6) and set MUJOCO_GL=osmesa; now MUJOCO_GL="
+            f"{os.environ.get('MUJOCO_GL', 'unset')}"
+        ) from error
+
+
+def render_frames(
+    spec: RobotSpec, qpos: torch.Tensor, width: int = 640, height: int = 480, camera: str = "track"
+) -> Iterator[np.ndarray]:
+    """Images (height, width, 3) uint8 of the configurations `qpos` (T, nq)."""
+    model = build_model(spec)
+    data = mujoco.MjData(model)
+    with open_renderer(model, width, height) as renderer:
+        for row in qpos.numpy():
+            data.qpos[:] = row
+            mujoco.mj_forward(model, data)
+            renderer.update_scene(data, camera)
+            yield renderer.render().copy()
+
+
+def write_video(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
+    """Write frames as MP4, atomically."""
+    import imageio.v2 as imageio
+
+    def write(temporary: Path) -> None:
+        with imageio.get_writer(temporary, format="FFMPEG", fps=fps, macro_block_size=8, quality=7) as writer:  # pyright: ignore
+            for frame in frames:
+                writer.append_data(frame)
+
+    write_atomically(path, write)
+
+
+def contact_sheet(path: Path, frames: list[np.ndarray], columns: int) -> None:
+    """Write frames as one PNG, row by row."""
+    import imageio.v2 as imageio
+
+    blank = np.full_like(frames[0], 255)
+    padded = frames + [blank] * (-len(frames) % columns)
+    rows = [np.concatenate(padded[i : i + columns], 1) for i in range(0, len(padded), columns)]
+    write_atomically(path, lambda p: imageio.imwrite(p, np.concatenate(rows, 0), format="png"))  # pyright: ignore
+
+
+def record_tour(cfg: H1EnvConfig, policy: PolicyFunction, seed: int = 0) -> tuple[H1Env, torch.Tensor]:
+    """One nominal robot on the tour. Returns the environment and its `qpos` (T, nq) at every control step."""
+    cfg.num_envs, cfg.seed = 1, seed
+    cfg.randomization.enabled = cfg.hand_forces.enabled = cfg.assist.enabled = False
+    cfg.terminations.episode_s = 1e4
+    env = H1Env(cfg)
+    rows: list[torch.Tensor] = []
+    nominal = env.spec.nominal_height_m
+    obs = env.get_observations()
+    for seconds, vx, vy, yaw, stand, offset in TOUR:
+        env.commands.override(
+            torch.tensor([[vx, vy]]), torch.tensor([yaw]), torch.tensor([stand]), torch.tensor([nominal + offset])
+        )
+        for _ in range(round(seconds / env.dt)):
+            obs, _, _, _ = env.step(policy(as_dict(obs)))
+            rows.append(env.sim.qpos[0].clone())
+    return env, torch.stack(rows)
+
+
+def tour_video(path: Path, cfg: H1EnvConfig, policy: PolicyFunction, sheet: Path | None = None) -> None:
+    """Write a video (and a contact sheet) of the tour.
+
+    Raises:
+        RenderingUnavailable: there is no OpenGL to be had.
+    """
+    env, qpos = record_tour(cfg, policy)
+    stride = 2
+    frames = list(render_frames(env.spec, qpos[::stride]))
+    write_video(path, iter(frames), 1.0 / (env.dt * stride))
+    if sheet is not None:
+        contact_sheet(sheet, frames[:: max(1, len(frames) // 24)][:24], 6)

@@ -1,0 +1,65 @@
+"""Evaluations as JSON, tables and plots."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from cotap.agents.checkpoint import write_atomically
+from cotap.evaluation.metrics import moving_average, settled
+from cotap.evaluation.rollout import Trajectory
+
+UNITS = {
+    "e_lin": "m/s", "e_lin_gait": "m/s", "e_yaw": "rad/s", "e_yaw_gait": "rad/s", "e_height": "m", "e_upper": "rad",
+    "e_ee": "m", "j_upper": "Nm", "stand_drift": "m/s", "foot_slip": "m/s", "swing_height": "m",
+}  # fmt: skip
+
+
+def table(result: dict[str, Any]) -> str:
+    """A Markdown table of an evaluation's metrics."""
+    lines = ["| measure | mean | std | 95 % interval | unit |", "|---|---|---|---|---|"]
+    for name, m in result["metrics"].items():
+        if m["mean"] is None:
+            lines.append(f"| {name} | - | - | {m['reason']} | |")
+            continue
+        low, high = m["ci95"]
+        lines.append(f"| {name} | {m['mean']:.4f} | {m['std']:.4f} | {low:.4f} to {high:.4f} | {UNITS.get(name, '')} |")
+    for name, value in result.get("slopes", {}).items():
+        lines.append(f"| {name} | {'-' if value is None else f'{value:.3f}'} | | | |")
+    falls = f"{result['num_falls']} of {result['num_envs']} worlds fell"
+    return "\n".join([*lines, "", f"{result['protocol']}, {result['method']}: {falls}, {result['seconds']:.1f} s"])
+
+
+def plot_tracking(path: Path, t: Trajectory, gait_period_s: float, settle_s: float) -> None:
+    """Commanded against gait-averaged measured velocity, one panel per axis, and heights in stance."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    measured = moving_average(t.velocity, round(gait_period_s / t.dt))
+    ok = settled(t, max(settle_s, gait_period_s))
+    walking, standing = ok & ~t.stand, ok & t.stand
+    figure, axes = plt.subplots(1, 4, figsize=(15, 3.9), constrained_layout=True)
+    panels = [
+        (f"{name} [{unit}]", t.command[..., i], measured[..., i], walking)
+        for i, (name, unit) in enumerate(
+            (("forward velocity", "m/s"), ("sideways velocity", "m/s"), ("yaw rate", "rad/s"))
+        )
+    ]
+    panels.append(("torso height, standing [m]", t.height_command, t.height, standing))
+    for axis, (label, commanded, got, mask) in zip(axes, panels, strict=True):
+        x, y = commanded[mask], got[mask]
+        keep = torch.randperm(x.numel(), generator=torch.Generator().manual_seed(0))[:4000]
+        axis.scatter(x[keep], y[keep], s=2, alpha=0.25, color="#2171b5", linewidths=0)
+        if x.numel():
+            ends = [float(x.min()), float(x.max())]
+            axis.plot(ends, ends, color="0.3", lw=1, ls="--", label="ideal")
+        axis.set_xlabel(f"commanded {label}")
+        axis.set_ylabel("measured")
+        axis.grid(alpha=0.2)
+    axes[0].legend(loc="upper left", frameon=False)
+    write_atomically(path, lambda p: figure.savefig(p, dpi=130, format=path.suffix.lstrip(".") or "png"))
+    plt.close(figure)

@@ -1,0 +1,82 @@
+"""Running a policy in many worlds and recording what happens."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+
+import torch
+from tqdm import tqdm
+
+from cotap.agents.actors import as_dict
+from cotap.envs import H1Env
+
+PolicyFunction = Callable[[dict[str, torch.Tensor]], torch.Tensor]
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Recorded tensors, T steps of N worlds; a world's record is meaningful up to its fall, that step included."""
+
+    dt: float
+    velocity: torch.Tensor
+    """(T, N, 3) torso velocity x, y in the heading frame [m/s] and yaw rate [rad/s]."""
+    command: torch.Tensor
+    """(T, N, 3) what they were asked to be."""
+    stand: torch.Tensor
+    """(T, N) bool."""
+    height: torch.Tensor
+    """(T, N) [m]."""
+    height_command: torch.Tensor
+    """(T, N) [m]."""
+    position: torch.Tensor
+    """(T, N, 2) horizontal position of the torso in the world [m]."""
+    arm_error: torch.Tensor
+    """(T, N, U) arm joint angles minus reference [rad]."""
+    arm_torque: torch.Tensor
+    """(T, N, U) [Nm]."""
+    hand_error: torch.Tensor
+    """(T, N, H) distance of the hands from their reference in the torso frame [m]."""
+    foot_contact: torch.Tensor
+    """(T, N, F) bool."""
+    foot_speed: torch.Tensor
+    """(T, N, F) horizontal [m/s]."""
+    foot_height: torch.Tensor
+    """(T, N, F) of the soles' centres [m]."""
+    fell: torch.Tensor
+    """(T, N) bool: the world fell in that step."""
+
+    def alive(self) -> torch.Tensor:
+        """(T, N) bool: the world has not fallen up to and including this step."""
+        return self.fell.cumsum(0) == 0
+
+
+def record_rollout(env: H1Env, policy: PolicyFunction, steps: int, progress: bool = True) -> Trajectory:
+    """Run `policy` for `steps` control steps from a fresh start of every world."""
+    obs = env.reset()
+    rows: dict[str, list[torch.Tensor]] = {f.name: [] for f in fields(Trajectory) if f.name != "dt"}
+    for _ in tqdm(range(steps), desc="rollout", unit="step", disable=not progress, leave=False):
+        obs, _, _, extras = env.step(policy(as_dict(obs)))
+        for name, value in _row(env, extras["falls"]).items():
+            rows[name].append(value)
+    return Trajectory(dt=env.dt, **{name: torch.stack(values) for name, values in rows.items()})
+
+
+def _row(env: H1Env, fell: torch.Tensor) -> dict[str, torch.Tensor]:
+    r, upper = env.record, env.action_slices["upper"]
+    s, hands = r.state, len(env.spec.arms)
+    return {
+        "velocity": torch.cat((s.torso_linear_velocity_h[:, :2], s.yaw_rate.unsqueeze(1)), 1),
+        "command": torch.cat((r.command.velocity_h, r.command.yaw_rate.unsqueeze(1)), 1),
+        "stand": r.command.stand > 0.5,
+        "height": s.height,
+        "height_command": r.command.height,
+        "position": s.torso_pos_w[:, :2],
+        "arm_error": s.joint_pos[:, upper] - r.reference.position,
+        "arm_torque": r.torque[:, upper],
+        "hand_error": (r.key_points_t - r.key_points_reference_t)[:, :hands].norm(dim=2),
+        "foot_contact": s.foot_contact,
+        "foot_speed": s.foot_velocity_w[:, :, :2].norm(dim=2),
+        "foot_height": s.foot_pos_w[:, :, 2],
+        "fell": fell,
+    }
