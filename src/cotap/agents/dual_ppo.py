@@ -42,7 +42,7 @@ class DualPPOConfig:
     """Trace decay of the advantage estimates."""
     clip: float = 0.2
     """Clip range of the surrogate and of values."""
-    entropy: float = 0.003
+    entropy: float = 0.002
     """Weight of the entropy bonus."""
     value: float = 1.0
     """Weight of the value loss."""

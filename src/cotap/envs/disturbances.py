@@ -88,6 +88,9 @@ class HandForces(Stateful):
         return force * holdable.unsqueeze(-1)
 
 
+_LAST_SHARE = 0.02
+
+
 @dataclass
 class AssistConfig:
     """A wrench on the base that carries the robot through its first steps and fades to nothing.
@@ -97,19 +100,19 @@ class AssistConfig:
 
     enabled: bool = False
     """Whether to assist; training switches it on."""
-    full_samples: float = 1.5e6
+    full_samples: float = 4e5
     """Environment steps, over all worlds, with full assistance."""
-    end_samples: float = 7e6
+    end_samples: float = 5e6
     """Environment steps after which there is none."""
-    upright_stiffness: float = 400.0
+    upright_stiffness: float = 300.0
     """[Nm/rad]."""
-    upright_damping: float = 40.0
+    upright_damping: float = 30.0
     """[Nms/rad]."""
-    yaw_gain: float = 50.0
+    yaw_gain: float = 15.0
     """Turning torque towards the commanded yaw rate [Nm per rad/s]."""
-    velocity_gain: float = 300.0
+    velocity_gain: float = 100.0
     """Horizontal pull towards the commanded velocity [N per m/s]."""
-    force_limit: float = 150.0
+    force_limit: float = 50.0
     """Largest pull [N]."""
     weight_share: float = 0.3
     """Share of the robot's weight that is lifted."""
@@ -134,12 +137,16 @@ class AssistConfig:
             require_range(f"assist.{name}", getattr(self, name), 0.0, 1e6)
 
     def share(self, samples: float) -> float:
-        """Share of the assistance left after `samples` environment steps."""
-        if not self.enabled:
+        """Share of the assistance left after `samples` environment steps.
+
+        It fades exponentially: a gantry of half the gains still holds the robot, so equal times go to equal ratios.
+        """
+        if not self.enabled or samples >= self.end_samples:
             return 0.0
         if samples <= self.full_samples:
             return 1.0
-        return max(0.0, 1.0 - (samples - self.full_samples) / max(self.end_samples - self.full_samples, 1.0))
+        progress = (samples - self.full_samples) / (self.end_samples - self.full_samples)
+        return (_LAST_SHARE**progress - _LAST_SHARE) / (1.0 - _LAST_SHARE)
 
 
 def assist_wrench(

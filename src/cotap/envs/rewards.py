@@ -63,7 +63,8 @@ class LowerRewards:
 
     track_velocity: float = 1.0
     track_velocity_closely: float = 1.5
-    track_yaw_rate: float = 1.25
+    track_yaw_rate: float = 0.6
+    track_yaw_rate_closely: float = 1.0
     track_height: float = 0.75
     upright: float = -3.0
     vertical_velocity: float = -0.5
@@ -116,8 +117,13 @@ def track_velocity_closely(s: StepRecord) -> torch.Tensor:
 
 
 def track_yaw_rate(s: StepRecord) -> torch.Tensor:
-    """Angular velocity about the vertical against its command."""
-    return torch.exp(-(s.command.yaw_rate - s.state.yaw_rate).square() / 0.06)
+    """Angular velocity about the vertical against its command, wide kernel."""
+    return torch.exp(-(s.command.yaw_rate - s.state.yaw_rate).square() / 0.25)
+
+
+def track_yaw_rate_closely(s: StepRecord) -> torch.Tensor:
+    """As above, narrow kernel."""
+    return torch.exp(-(s.command.yaw_rate - s.state.yaw_rate).square() / 0.03)
 
 
 def track_height(s: StepRecord) -> torch.Tensor:
