@@ -263,7 +263,7 @@ class H1Env(VecEnv):
         record = self._record(action, velocity_before, fell)
         self.record = record
         rewards, log = self._reward(record, bad)
-        self._last_action = action
+        self._last_action = action.clone()  # the record keeps its own: restarts clear this one
         done = fell | time_out
         log.update(self._log(record, fell, time_out, bad))
         if done.any():
@@ -291,9 +291,9 @@ class H1Env(VecEnv):
             "sim": {"state": snapshot.state, "sensors": snapshot.sensors, "fields": snapshot.fields},
             "parts": {name: part.state_dict() for name, part in self._parts().items()},
             "delay": {
-                "delay_s": self.targets.delay_s,
-                "previous": self.targets.previous,
-                "current": self.targets.current,
+                "delay_s": self.targets.delay_s.clone(),
+                "previous": self.targets.previous.clone(),
+                "current": self.targets.current.clone(),
             },
             "episode_length": self.episode_length_buf.clone(),
             "last_action": self._last_action.clone(),
@@ -409,7 +409,7 @@ class H1Env(VecEnv):
             total, terms = group(record)
             # A diverged world has no meaningful reward; its episode ends and is counted.
             totals.append(torch.where(bad, torch.zeros_like(total), total))
-            log.update({f"/{group.name}/{name}": value[~bad].mean() for name, value in terms.items()})
+            log.update({f"/{group.name}/{name}": _mean(value[~bad]) for name, value in terms.items()})
         return torch.stack(totals, 1), log
 
     def _log(
@@ -424,14 +424,14 @@ class H1Env(VecEnv):
         arm_error = (r.state.joint_pos[:, self.num_lower :] - r.reference.position)[ok].norm(dim=1)
         swing_speed = r.state.foot_pos_w[ok][:, :, 2].amax(1)
         return {
-            "/command/error_velocity": (measured - commanded)[:, :2].norm(dim=1).mean(),
-            "/command/error_yaw_rate": error[:, 2].mean(),
-            "/command/error_height": (r.state.height - r.command.height)[ok].abs().mean(),
+            "/command/error_velocity": _mean((measured - commanded)[:, :2].norm(dim=1)),
+            "/command/error_yaw_rate": _mean(error[:, 2]),
+            "/command/error_height": _mean((r.state.height - r.command.height)[ok].abs()),
             "/command/slope_x": slope[0],
             "/command/slope_y": slope[1],
             "/command/slope_yaw": slope[2],
-            "/command/e_upper": arm_error.mean(),
-            "/command/highest_foot": swing_speed.mean(),
+            "/command/e_upper": _mean(arm_error),
+            "/command/highest_foot": _mean(swing_speed),
             "/episode/falls_per_s": fell.float().mean() / self.dt,
             "/episode/time_outs_per_s": time_out.float().mean() / self.dt,
             "/episode/diverged": torch.tensor(float(self.num_diverged)),
@@ -461,6 +461,7 @@ class H1Env(VecEnv):
         self.sim.reset(mask, qpos, qvel)
         self.targets.reset(mask, joints)
         self._last_action[mask] = 0.0
+        self._hand_force_w[mask] = 0.0
         self.episode_length_buf[mask] = 0
         self.state = self.reader.read()
 
@@ -489,3 +490,8 @@ class H1Env(VecEnv):
         return torch.cat(
             (quat_from_matrix(s.torso_rotation_w), s.torso_linear_velocity_h, self._hand_force_w.flatten(1)), 1
         )
+
+
+def _mean(values: torch.Tensor) -> torch.Tensor:
+    """Mean of `values` (n,); 0 if there are none, as when all worlds have diverged."""
+    return values.sum() / max(values.numel(), 1)

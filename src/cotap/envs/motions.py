@@ -76,7 +76,7 @@ class MotionGenerator(Stateful):
         self._high = torch.minimum(high - cfg.limit_margin_rad, default + cfg.range_rad)
         self._speed = cfg.velocity_share * torch.tensor([j.velocity_limit_rad_s for j in joints])
         self._joints_per_arm = len(spec.arms[0].joints)
-        self._weights = torch.tensor([getattr(cfg, kind) for kind in KINDS])
+        self._weights = torch.tensor([float(getattr(cfg, kind)) for kind in KINDS])
         n, u = num_envs, len(joints)
         self._start, self._goal = default.repeat(n, 1), default.repeat(n, 1)
         self._amplitude = torch.zeros(n, u)
@@ -99,6 +99,7 @@ class MotionGenerator(Stateful):
         near = 0.5 * uniform(rng, -1.0, 1.0, n, self._default.shape[0])
         span = torch.where(near < 0.0, self._default - self._low, self._high - self._default)
         self._goal[mask] = self._default + near * span
+        self._out_and_back[mask] = 0.0  # else an interrupted punch would start again from where it began
         self._draw(mask, rng)
 
     def step(self, rng: torch.Generator) -> None:
