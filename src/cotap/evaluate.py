@@ -78,7 +78,7 @@ def velocity_tracking(options: VelocityTrackingOptions) -> dict[str, Any]:
     env = H1Env(cfg)
     require_layout(path, policy.layout, json.loads(json.dumps(env.layout())))
     if not protocol.arm_motion:
-        env.motions.hold(env.motions.current().position[:1] * 0.0)
+        env.motions.hold(env.motions.default)
     start = time.perf_counter()
     trajectory = record_rollout(env, policy, round(protocol.episode_seconds / env.dt))
     seconds = time.perf_counter() - start

@@ -71,7 +71,7 @@ class MotionGenerator(Stateful):
         joints = [spec.joints[i] for i in spec.indices(spec.upper_joints)]
         default = torch.tensor([j.default_rad for j in joints])
         low, high = torch.tensor([j.range_rad for j in joints]).unbind(1)
-        self._default = default
+        self.default = default
         self._low = torch.maximum(low + cfg.limit_margin_rad, default - cfg.range_rad)
         self._high = torch.minimum(high - cfg.limit_margin_rad, default + cfg.range_rad)
         self._speed = cfg.velocity_share * torch.tensor([j.velocity_limit_rad_s for j in joints])
@@ -96,9 +96,9 @@ class MotionGenerator(Stateful):
         n = int(mask.sum())
         if n == 0 or self._fixed:
             return
-        near = 0.5 * uniform(rng, -1.0, 1.0, n, self._default.shape[0])
-        span = torch.where(near < 0.0, self._default - self._low, self._high - self._default)
-        self._goal[mask] = self._default + near * span
+        near = 0.5 * uniform(rng, -1.0, 1.0, n, self.default.shape[0])
+        span = torch.where(near < 0.0, self.default - self._low, self._high - self.default)
+        self._goal[mask] = self.default + near * span
         self._out_and_back[mask] = 0.0  # else an interrupted punch would start again from where it began
         self._draw(mask, rng)
 
@@ -129,7 +129,7 @@ class MotionGenerator(Stateful):
         n = int(mask.sum())
         if n == 0:
             return
-        u = self._default.shape[0]
+        u = self.default.shape[0]
         # Where a world ends up: out-and-back and oscillating segments end where they began.
         start = torch.where(self._out_and_back[mask, None] > 0.5, self._start[mask], self._goal[mask])
         kind = torch.multinomial(self._weights, n, replacement=True, generator=rng)

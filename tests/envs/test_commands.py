@@ -1,0 +1,167 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from cotap.envs.commands import CommandConfig, CommandSource, desired_contact, swing_progress
+
+NOMINAL, DT = 1.028, 0.02
+
+
+def source(num_envs=1, **cfg) -> CommandSource:
+    return CommandSource(CommandConfig(**cfg), num_envs, NOMINAL, DT)
+
+
+def everyone(n) -> torch.Tensor:
+    return torch.ones(n, dtype=torch.bool)
+
+
+def test_draws_follow_ranges_and_shares(rng):
+    n = 20_000
+    commands = source(n)
+    commands.reset(everyone(n), rng)
+    c = commands.current()
+    walking = c.stand == 0
+    assert float(c.stand.mean()) == pytest.approx(0.2, abs=0.015)
+    for values, low, high in (
+        (c.velocity_h[walking, 0], -1.1, 1.1),
+        (c.velocity_h[walking, 1], -0.6, 0.6),
+        (c.yaw_rate[walking], -0.9, 0.9),
+    ):
+        assert low <= float(values.min()) < low + 0.02
+        assert high - 0.02 < float(values.max()) <= high
+        assert float((values == 0).float().mean()) == pytest.approx(0.2, abs=0.015)
+        assert float(values.mean()) == pytest.approx(0.0, abs=0.02)
+    assert not c.velocity_h[~walking].any()
+    assert not c.yaw_rate[~walking].any()
+    assert torch.equal(c.height, torch.full((n,), NOMINAL))  # the height starts at nominal
+    assert not c.phase[~walking].any()
+    assert float(c.phase[walking].mean()) == pytest.approx(0.5, abs=0.02)
+
+
+def test_height_is_commanded_in_stance_only_and_approached_at_its_rate(rng):
+    n = 4000
+    commands = source(n, resample_s=(100.0, 100.0))
+    commands.reset(everyone(n), rng)
+    heights = [commands.current().height]
+    for _ in range(60):
+        commands.step(rng)
+        heights.append(commands.current().height)
+    heights = torch.stack(heights)
+    assert float(heights.diff(dim=0).abs().max()) == pytest.approx(0.25 * DT, abs=1e-6)
+    # 0.2 m at 0.25 m/s take 0.8 s; after 1.2 s all have arrived.
+    stand = commands.current().stand > 0.5
+    assert torch.equal(heights[-1], heights[-11])
+    assert torch.equal(heights[-1, ~stand], heights[0, ~stand])
+    offset = heights[-1, stand] - NOMINAL
+    assert -0.2 <= float(offset.min()) < -0.19
+    assert float(offset.max()) <= 1e-6
+    assert float((offset.abs() < 1e-6).float().mean()) == pytest.approx(0.5, abs=0.06)
+
+
+def test_commands_are_held_and_then_resampled(rng):
+    commands = source(1, resample_s=(0.1, 0.1), stand_probability=0.0, axis_zero_probability=0.0)
+    commands.reset(everyone(1), rng)
+    seen = [commands.current().velocity_h[0, 0].item()]
+    for _ in range(20):
+        commands.step(rng)
+        seen.append(commands.current().velocity_h[0, 0].item())
+    lengths = [seen.count(v) for v in dict.fromkeys(seen)]
+    assert all(4 <= n <= 6 for n in lengths[:-1])
+    assert len(lengths) == 5
+
+
+def test_reset_touches_only_its_worlds(rng):
+    commands = source(2, stand_probability=0.0, axis_zero_probability=0.0)
+    commands.reset(everyone(2), rng)
+    before = commands.current()
+    commands.reset(torch.tensor([False, True]), rng)
+    after = commands.current()
+    assert torch.equal(before.velocity_h[0], after.velocity_h[0])
+    assert before.phase[0] == after.phase[0]
+    assert (before.velocity_h[1] != after.velocity_h[1]).all()
+
+
+def test_phase_runs_one_stride_a_period_and_rests_in_stance(rng):
+    commands = source(2)
+    zero = torch.zeros(2)
+    commands.override(torch.zeros(2, 2), zero, torch.tensor([0.0, 1.0]), zero + NOMINAL)
+    commands.reset(everyone(2), rng)
+    start = commands.current().phase.clone()
+    commands.step(rng)
+    assert float((commands.current().phase[0] - start[0]).remainder(1.0)) == pytest.approx(0.02 / 0.8, abs=1e-6)
+    for _ in range(39):
+        commands.step(rng)
+    assert float(commands.current().phase[0]) == pytest.approx(float(start[0]), abs=1e-5)
+    assert commands.current().phase[1] == 0.0
+
+
+def test_override_holds_through_resets_and_steps(rng):
+    commands = source(1, resample_s=(0.02, 0.02))
+    commands.override(torch.tensor([[0.3, -0.2]]), torch.tensor([0.4]), torch.tensor([True]), torch.tensor([0.9]))
+    commands.reset(everyone(1), rng)
+    for _ in range(40):
+        commands.step(rng)
+    c = commands.current()
+    assert c.velocity_h.tolist() == [[pytest.approx(0.3), pytest.approx(-0.2)]]
+    assert float(c.yaw_rate) == pytest.approx(0.4)
+    assert float(c.stand) == 1.0
+    assert float(c.height) == pytest.approx(0.9)
+
+
+def test_set_velocity_replaces_velocities_only(rng):
+    commands = source(1, stand_probability=1.0)
+    commands.reset(everyone(1), rng)
+    commands.set_velocity(torch.tensor([[0.5, 0.1]]), torch.tensor([-0.3]))
+    c = commands.current()
+    assert c.velocity_h.tolist() == [[pytest.approx(0.5), pytest.approx(0.1)]]
+    assert float(c.yaw_rate) == pytest.approx(-0.3)
+    assert float(c.stand) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("phase", "left", "right"),
+    [(0.0, True, True), (0.05, True, True), (0.1, True, False), (0.49, True, False), (0.55, True, True),
+     (0.6, False, True), (0.95, False, True)],
+)  # fmt: skip
+def test_desired_contact_alternates(phase, left, right):
+    assert desired_contact(torch.tensor([phase]), torch.zeros(1), 2).tolist() == [[left, right]]
+    assert desired_contact(torch.tensor([phase]), torch.ones(1), 2).tolist() == [[True, True]]
+
+
+def test_swing_progress_runs_from_lift_off_to_touch_down():
+    phase = torch.tensor([0.3, 0.58, 0.79, 0.999])
+    left = swing_progress(phase, 2)[:, 0]
+    torch.testing.assert_close(left, torch.tensor([0.0, 0.0, 0.5, 0.9976]), atol=1e-3, rtol=0)
+    torch.testing.assert_close(swing_progress(phase - 0.5, 2)[:, 1], left, atol=1e-5, rtol=0)
+
+
+def test_state_dict_continues_exactly(rng):
+    commands = source(4)
+    commands.reset(everyone(4), rng)
+    commands.step(rng)
+    saved, random_state = commands.state_dict(), rng.get_state()
+    other = source(4)
+    other.load_state_dict(saved)
+    futures = []
+    for c in (commands, other):
+        rng.set_state(random_state)
+        for _ in range(500):
+            c.step(rng)
+        now = c.current()
+        futures.append(torch.cat((now.velocity_h, now.height[:, None], now.phase[:, None]), 1))
+    assert torch.equal(*futures)
+    with pytest.raises(ValueError, match=r"CommandSource\._target must have shape"):
+        source(5).load_state_dict(saved)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("velocity_x", (1.0, -1.0)), ("stand_probability", 1.5), ("gait_period_s", 0.0), ("resample_s", (0.0, 1.0)),
+     ("yaw_rate", (math.nan, 1.0))],
+)  # fmt: skip
+def test_bad_fields_are_named(field, value):
+    with pytest.raises(ValueError, match=f"commands.{field}"):
+        source(**{field: value})

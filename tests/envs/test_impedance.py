@@ -1,0 +1,99 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from cotap.envs.impedance import ImpedanceConfig, TorsoImpedance
+
+DT = 0.02
+ALIGNED = torch.eye(3).unsqueeze(0)
+
+
+def follow(impedance, x, target, target_velocity, seconds, dt=DT):
+    """A torso that does exactly what it is told."""
+    path = [x]
+    for _ in range(round(seconds / dt)):
+        x = x + dt * impedance.step(x, ALIGNED, target, target_velocity)
+        path.append(x)
+    return torch.stack(path)
+
+
+def test_first_step_by_hand():
+    # Implicit damping: (v + dt/m (K e + D vt)) / (1 + dt D / m), with K e = 20 * 0.1, D vt = 28 * 0.05, dt/m = 0.002.
+    impedance = TorsoImpedance(ImpedanceConfig(), 1, DT)
+    v = impedance.step(torch.tensor([[0.2, 0.0]]), ALIGNED, torch.tensor([[0.3, -0.1]]), torch.tensor([[0.05, 0.0]]))
+    torch.testing.assert_close(v, torch.tensor([[0.002 * (2.0 + 1.4) / 1.056, 0.002 * -2.0 / 1.056]]))
+
+
+def test_follows_the_closed_form_of_a_critically_damped_spring():
+    m, k = 10.0, 20.0
+    cfg = ImpedanceConfig(mass_kg=m, stiffness=k, damping=2 * math.sqrt(k * m), speed_limit=10.0)
+    dt = 0.0005
+    path = follow(
+        TorsoImpedance(cfg, 1, dt), torch.zeros(1, 2), torch.tensor([[0.5, -0.2]]), torch.zeros(1, 2), 4.0, dt
+    )
+    t = torch.arange(path.shape[0]) * dt
+    omega = math.sqrt(k / m)
+    expected = 1 - (1 + omega * t) * torch.exp(-omega * t)
+    torch.testing.assert_close(path[:, 0, 0], 0.5 * expected, atol=1e-3, rtol=0)
+    torch.testing.assert_close(path[:, 0, 1], -0.2 * expected, atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("damping", [5.0, 28.0, 5000.0])
+def test_settles_at_the_target_with_any_damping(damping):
+    impedance = TorsoImpedance(ImpedanceConfig(stiffness=20.0 + damping, damping=damping), 1, DT)
+    path = follow(impedance, torch.zeros(1, 2), torch.tensor([[0.5, -0.2]]), torch.zeros(1, 2), 30.0)
+    torch.testing.assert_close(path[-1], torch.tensor([[0.5, -0.2]]), atol=2e-3, rtol=0)
+
+
+def test_follows_a_moving_target_without_lag():
+    impedance = TorsoImpedance(ImpedanceConfig(), 1, DT)
+    x, target, speed = torch.zeros(1, 2), torch.zeros(1, 2), torch.tensor([[0.4, 0.1]])
+    for _ in range(1000):
+        target = target + DT * speed
+        command = impedance.step(x, ALIGNED, target, speed)
+        x = x + DT * command
+    torch.testing.assert_close(command, speed, atol=1e-4, rtol=0)
+    torch.testing.assert_close(x, target, atol=0.02, rtol=0)
+
+
+def test_command_is_in_the_heading_frame():
+    """A robot that faces the world's y axis has a target at +x on its right: minus y of its own."""
+    facing_y = torch.tensor([[[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]])
+    impedance = TorsoImpedance(ImpedanceConfig(), 1, DT)
+    v = impedance.step(torch.zeros(1, 2), facing_y, torch.tensor([[1.0, 0.0]]), torch.zeros(1, 2))
+    assert float(v[0, 1]) < -0.01
+    assert abs(float(v[0, 0])) < 1e-8
+
+
+def test_turning_does_not_turn_the_velocity_in_the_world():
+    a, b = (TorsoImpedance(ImpedanceConfig(), 1, DT) for _ in range(2))
+    zero, target = torch.zeros(1, 2), torch.tensor([[1.0, 0.5]])
+    back = torch.diag(torch.tensor([-1.0, -1.0, 1.0])).unsqueeze(0)
+    for heading in (ALIGNED, back, ALIGNED):
+        straight, turned = a.step(zero, ALIGNED, target, zero), b.step(zero, heading, target, zero)
+    torch.testing.assert_close(straight, turned)
+
+
+def test_speed_is_limited_and_keeps_its_direction():
+    impedance = TorsoImpedance(ImpedanceConfig(stiffness=1e4, speed_limit=0.6), 1, DT)
+    for _ in range(20):
+        v = impedance.step(torch.zeros(1, 2), ALIGNED, torch.tensor([[30.0, -40.0]]), torch.zeros(1, 2))
+    torch.testing.assert_close(v, torch.tensor([[0.36, -0.48]]))
+
+
+def test_reset_stops_only_its_worlds():
+    impedance = TorsoImpedance(ImpedanceConfig(), 2, DT)
+    args = (torch.zeros(2, 2), torch.eye(3).expand(2, 3, 3), torch.ones(2, 2), torch.zeros(2, 2))
+    first = impedance.step(*args)
+    impedance.reset(torch.tensor([True, False]))
+    second = impedance.step(*args)
+    torch.testing.assert_close(second[0], first[0])
+    assert (second[1] > first[1]).all()
+
+
+def test_bad_fields_are_named():
+    with pytest.raises(ValueError, match=r"impedance\.mass_kg must lie in"):
+        TorsoImpedance(ImpedanceConfig(mass_kg=0.0), 1, DT)

@@ -1,0 +1,200 @@
+"""Every term on a hand-made step: a robot that does all right, and one thing wrong with it at a time."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from cotap.compliance.kinematics import ChainPose
+from cotap.envs import rewards
+from cotap.envs.commands import Command
+from cotap.envs.motions import ArmReference
+from cotap.envs.rewards import LowerRewards, RewardGroup, StepRecord, UpperRewards
+from cotap.envs.state import RobotState
+
+DT = 0.02
+HEIGHT = 1.0
+LEFT_LIFTED = {"desired_contact": [[False, True]], "swing": [[0.5, 0.0]]}
+
+
+def matrix_about_z(yaw: float) -> torch.Tensor:
+    c, s = math.cos(yaw), math.sin(yaw)
+    return torch.tensor([[[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]])
+
+
+def perfect() -> StepRecord:
+    """One world of a robot with 3 lower and 2 upper joints that does just what it should."""
+    eye = torch.eye(3).unsqueeze(0)
+    state = RobotState(
+        joint_pos=torch.tensor([[0.1, -0.2, 0.3, 0.0, 0.0]]),
+        joint_vel=torch.zeros(1, 5),
+        base_rotation_w=eye,
+        torso_pos_w=torch.tensor([[3.0, -2.0, HEIGHT]]),
+        torso_rotation_w=eye,
+        heading_w=eye,
+        torso_linear_velocity_h=torch.tensor([[0.5, -0.2, 0.0]]),
+        torso_angular_velocity_t=torch.tensor([[0.0, 0.0, 0.4]]),
+        yaw_rate=torch.tensor([0.4]),
+        projected_gravity_t=torch.tensor([[0.0, 0.0, -1.0]]),
+        arms=ChainPose(torch.zeros(1, 2, 1, 3), torch.zeros(1, 2, 1, 3), eye.repeat(1, 2, 1, 1), torch.zeros(1, 2, 3)),
+        foot_force=torch.tensor([[250.0, 250.0]]),
+        foot_pos_w=torch.tensor([[[3.0, -1.9, 0.0], [3.0, -2.1, 0.0]]]),
+        foot_velocity_w=torch.zeros(1, 2, 3),
+        foot_up_w=torch.tensor([[[0.0, 0.0, 1.0], [0.0, 0.0, 1.0]]]),
+        foot_forward_w=torch.tensor([[[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]]),
+    )
+    zero = torch.zeros(1, 5)
+    points = torch.tensor([[[0.2, 0.2, 0.1], [0.2, -0.2, 0.1]]])
+    return StepRecord(
+        state=state,
+        command=Command(
+            torch.tensor([[0.5, -0.2]]), torch.tensor([0.4]), torch.zeros(1), torch.tensor([HEIGHT]), torch.zeros(1)
+        ),
+        reference=ArmReference(torch.zeros(1, 2), torch.zeros(1, 2)),
+        action=zero,
+        last_action=zero.clone(),
+        joint_acceleration=zero.clone(),
+        torque=zero.clone(),
+        desired_contact=torch.tensor([[True, True]]),
+        swing=torch.zeros(1, 2),
+        key_points_t=points,
+        key_points_reference_t=points.clone(),
+        key_velocities_t=torch.zeros(1, 2, 3),
+        key_velocities_reference_t=torch.zeros(1, 2, 3),
+        fell=torch.tensor([False]),
+        joint_low=torch.full((5,), -0.5),
+        joint_high=torch.full((5,), 0.5),
+        num_lower=3,
+        default_position=torch.tensor([0.1, -0.2, 0.3, 0.0, 0.0]),
+        sideways=(0,),
+    )
+
+
+def changed(**changes) -> StepRecord:
+    """The perfect step with some tensors, of the record, its state or its command, replaced."""
+    record = perfect()
+    for name, value in changes.items():
+        holder = next(h for h in (record, record.state, record.command) if hasattr(h, name))
+        value = torch.as_tensor(value)
+        assert value.shape == getattr(holder, name).shape
+        new = dataclasses.replace(holder, **{name: value})
+        if holder is record:
+            record = new
+        else:
+            field = "state" if isinstance(holder, RobotState) else "command"
+            record = dataclasses.replace(record, **{field: new})
+    return record
+
+
+# What each term gives when all is right.
+BEST = {
+    "track_velocity": 1.0, "track_velocity_closely": 1.0, "track_yaw_rate": 1.0, "track_yaw_rate_closely": 1.0, "track_height": 1.0,
+    "contact_schedule": 1.0, "alive": 1.0, "track_arms": 1.0, "track_key_points": 1.0, "track_key_velocities": 1.0,
+}  # fmt: skip
+ALL_TERMS = sorted({f.name for group in (LowerRewards, UpperRewards) for f in dataclasses.fields(group)})
+
+
+@pytest.mark.parametrize("term", ALL_TERMS)
+def test_a_perfect_step(term):
+    assert getattr(rewards, term)(perfect()).tolist() == [pytest.approx(BEST.get(term, 0.0), abs=1e-6)]
+
+
+TURNED_IN = torch.tensor([[[math.cos(0.3), -math.sin(0.3), 0.0], [1.0, 0.0, 0.0]]])
+CASES = [
+    ("track_velocity", {"torso_linear_velocity_h": [[0.2, 0.2, 0.0]]}, math.exp(-(0.09 + 0.16) / 0.25)),
+    ("track_velocity", {"torso_linear_velocity_h": [[0.5, -0.2, 9.0]]}, 1.0),
+    ("track_velocity_closely", {"velocity_h": [[0.6, -0.2]]}, math.exp(-0.01 / 0.04)),
+    ("track_yaw_rate", {"yaw_rate": [0.1]}, math.exp(-0.09 / 0.25)),
+    ("track_yaw_rate_closely", {"yaw_rate": [0.3]}, math.exp(-0.01 / 0.03)),
+    ("track_yaw_rate_closely", {"yaw_rate": [0.5]}, math.exp(-0.01 / 0.03)),
+    ("track_height", {"torso_pos_w": [[3.0, -2.0, 0.96]]}, math.exp(-0.0016 / 0.0025)),
+    ("upright", {"projected_gravity_t": [[0.3, -0.4, -math.sqrt(0.75)]]}, 0.25),
+    ("vertical_velocity", {"torso_linear_velocity_h": [[0.5, -0.2, -0.3]]}, 0.09),
+    ("roll_pitch_rate", {"torso_angular_velocity_t": [[0.3, -0.4, 7.0]]}, 0.25),
+    ("contact_schedule", {"foot_force": [[250.0, 4.9]]}, 0.5),
+    ("contact_schedule", {"desired_contact": [[False, False]]}, 0.0),
+    ("contact_schedule", {"foot_force": [[250.0, 0.0]], "desired_contact": [[True, False]]}, 1.0),
+    # Left foot in mid-swing should be 0.1 m up: it is on the floor, right, and 0.05 m too high.
+    ("swing_height", LEFT_LIFTED, 0.1),
+    ("swing_height", {**LEFT_LIFTED, "foot_pos_w": [[[3.0, -1.9, 0.1], [3.0, -2.1, 0.5]]]}, 0.0),
+    ("swing_height", {**LEFT_LIFTED, "foot_pos_w": [[[3.0, -1.9, 0.15], [3.0, -2.1, 0.0]]]}, 0.05),
+    # A quarter through the swing it should be half as high.
+    ("swing_height", {"desired_contact": [[False, True]], "swing": [[0.25, 0.0]]}, 0.05),
+    ("foot_slip", {"foot_velocity_w": [[[0.3, 0.4, 9.0], [0.0, -0.1, 0.0]]]}, 0.6),
+    ("foot_slip", {"foot_velocity_w": [[[0.3, 0.4, 0.0], [0.0, -0.1, 0.0]]], "foot_force": [[0.0, 9.0]]}, 0.1),
+    ("foot_flat", {"foot_up_w": [[[0.3, -0.4, 0.866], [0.0, 0.1, 0.995]]]}, 0.26),
+    ("foot_yaw", {"foot_forward_w": TURNED_IN}, math.sin(0.3) ** 2),
+    # Robot and feet turned together: nothing wrong. The robot alone: both feet are off by its angle.
+    ("foot_yaw", {"heading_w": matrix_about_z(-0.3), "foot_forward_w": TURNED_IN[:, [0, 0]]}, 0.0),
+    ("foot_yaw", {"heading_w": matrix_about_z(0.3)}, 2 * math.sin(0.3) ** 2),
+    ("feet_apart", {"foot_pos_w": [[[3.0, -1.95, 0.0], [3.0, -2.05, 0.0]]]}, 0.08),
+    ("feet_apart", {"foot_pos_w": [[[3.0, -2.05, 0.0], [3.0, -1.95, 0.0]]]}, 0.28),  # crossed
+    ("feet_apart", {"foot_pos_w": [[[3.0, -2.5, 0.0], [3.0, -1.5, 0.0]]]}, 0.3),  # no worse than this
+    ("feet_apart", {"foot_pos_w": [[[2.9, 0.0, 0.0], [3.1, 0.0, 0.0]]], "heading_w": matrix_about_z(math.pi / 2)}, 0.0),
+    ("feet_apart", {"foot_pos_w": [[[3.1, 0.0, 0.0], [2.9, 0.0, 0.0]]], "heading_w": matrix_about_z(math.pi / 2)}, 0.3),
+    ("sideways_joints", {"joint_pos": [[0.3, 5.0, 5.0, 5.0, 5.0]]}, 0.04),
+    ("stand_still", {"stand": [1.0], "joint_vel": [[1.0, 2.0, 0.0, 9.0, 9.0]]}, math.hypot(0.5, 0.2) + 0.05),
+    ("stand_still", {"joint_vel": [[1.0, 2.0, 0.0, 9.0, 9.0]]}, 0.0),
+    ("lower_torque", {"torque": [[1.0, -2.0, 3.0, 50.0, 50.0]]}, 14.0),
+    ("upper_torque", {"torque": [[50.0, 50.0, 50.0, 2.0, -3.0]]}, 13.0),
+    ("lower_acceleration", {"joint_acceleration": [[1.0, -2.0, 3.0, 50.0, 50.0]]}, 14.0),
+    ("upper_acceleration", {"joint_acceleration": [[50.0, 50.0, 50.0, 2.0, -3.0]]}, 13.0),
+    ("lower_action_rate", {"action": [[1, 2, 3, 9, 9.0]], "last_action": [[2, 2, 1, 0, 0.0]]}, 5.0),
+    ("upper_action_rate", {"action": [[9, 9, 9, 1, -1.0]], "last_action": [[0, 0, 0, 2, 1.0]]}, 5.0),
+    ("lower_joint_limits", {"joint_pos": [[-0.7, 0.6, 0.5, 9.0, -9.0]]}, 0.3),
+    ("upper_joint_limits", {"joint_pos": [[9.0, -9.0, 9.0, 0.7, -0.6]]}, 0.3),
+    ("alive", {"fell": [True]}, 0.0),
+    ("fall", {"fell": [True]}, 1.0),
+    ("track_arms", {"joint_pos": [[9.0, 9.0, 9.0, 0.1, -0.2]]}, math.exp(-0.05 / 0.06)),
+    ("track_key_points", {"key_points_t": [[[0.2, 0.2, 0.2], [0.2, -0.1, 0.1]]]}, math.exp(-0.02 / 0.01)),
+    ("track_key_velocities", {"key_velocities_t": [[[0.5, 0, 0], [0, -1.0, 0]]]}, math.exp(-1.25)),
+    ("arm_residual", {"action": [[9.0, 9.0, 9.0, 1.0, -2.0]]}, 5.0),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("term", "changes", "expected"), CASES)
+def test_by_hand(term, changes, expected):
+    assert getattr(rewards, term)(changed(**changes)).tolist() == [pytest.approx(expected, abs=1e-5)]
+
+
+def test_every_term_has_a_case_by_hand():
+    assert {term for term, _, _ in CASES} == set(ALL_TERMS)
+
+
+@pytest.mark.parametrize("weights", [LowerRewards(), UpperRewards()], ids=["lower", "upper"])
+@pytest.mark.parametrize("changes", [changes for _, changes, _ in CASES])
+def test_no_fault_pays(weights, changes):
+    """With the default weights: a weight of the wrong sign would pay for a fault."""
+    group = RewardGroup("group", weights, DT)
+    _, best = group(perfect())
+    _, terms = group(changed(**changes))
+    assert all(float(terms[name]) <= float(best[name]) + 1e-9 for name in terms)
+
+
+@pytest.mark.parametrize("cls", [LowerRewards, UpperRewards])
+def test_every_field_is_a_function_and_weights_it(cls):
+    for field in dataclasses.fields(cls):
+        weights = cls(**{f.name: 0.0 for f in dataclasses.fields(cls)})
+        setattr(weights, field.name, 3.0)
+        group = RewardGroup("only", weights, DT)
+        assert list(group.terms) == [field.name]
+        record = changed(fell=[True], torso_linear_velocity_h=[[0.1, 0.1, 0.1]])
+        value = float(getattr(rewards, field.name)(record))
+        once = field.name == "fall"
+        total, terms = group(record)
+        assert total.tolist() == [pytest.approx(3.0 * value * (1.0 if once else DT), abs=1e-7)]
+        assert torch.equal(terms[field.name], total)
+
+
+def test_the_sum_of_the_terms_is_the_reward():
+    record = changed(torque=[[1.0, -2.0, 3.0, 50.0, 50.0]], torso_linear_velocity_h=[[0.2, 0.2, 0.4]])
+    total, terms = RewardGroup("lower", LowerRewards(), DT)(record)
+    assert total.tolist() == [pytest.approx(sum(float(v) for v in terms.values()), abs=1e-6)]
+
+
+def test_weights_must_be_finite():
+    with pytest.raises(ValueError, match=r"rewards\.lower\.upright must be a finite number, got nan"):
+        RewardGroup("lower", LowerRewards(upright=math.nan), DT)

@@ -1,0 +1,108 @@
+"""The evaluation command, end to end, on the shipped policy."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from cotap.agents.checkpoint import load_checkpoint, save_checkpoint, sha256
+from cotap.evaluate import main
+from cotap.evaluation.policy import load_policy, shipped_checkpoint
+from cotap.evaluation.render import RenderingUnavailable, open_renderer
+from cotap.robots import h1
+from cotap.robots.mjcf import build_model
+
+SMALL = ["velocity-tracking", "--num-envs", "64", "--episode-seconds", "10", "--threads", "1"]
+
+
+def run(tmp_path: Path, *options: str, name: str = "result.json") -> dict:
+    out = tmp_path / name
+    assert main([*SMALL, "--json", str(out), *options]) == 0
+    return json.loads(out.read_text())
+
+
+def test_shipped_policy_reproduces_its_evaluation(tmp_path: Path):
+    path = shipped_checkpoint("base")
+    shipped = json.loads(path.with_name("base.velocity-tracking.small.json").read_text())
+    result = run(tmp_path)
+    assert shipped["settings"]["checkpoint_sha256"] == sha256(path) == result["settings"]["checkpoint_sha256"]
+    # Another processor rounds otherwise, and walking is chaotic: figures agree, digits need not.
+    for name in ("e_lin_gait", "e_yaw_gait", "e_height", "e_upper", "swing_height"):
+        assert result["metrics"][name]["mean"] == pytest.approx(shipped["metrics"][name]["mean"], rel=0.1), name
+    assert result["num_falls"] <= shipped["num_falls"] + 1
+    for axis in ("slope_x", "slope_y", "slope_yaw"):
+        assert result["slopes"][axis] == pytest.approx(shipped["slopes"][axis], abs=0.08)
+
+
+def test_shipped_checkpoint_carries_its_provenance():
+    path = shipped_checkpoint("base")
+    provenance = json.loads(path.with_suffix(".json").read_text())
+    assert provenance["sha256"] == sha256(path)
+    assert {"commit", "command", "seed", "samples", "wall_seconds", "config"} <= provenance.keys()
+    content = load_checkpoint(path)
+    assert content["learner"] == {}
+    assert content["env"] == {}
+    assert path.stat().st_size < 6 * 2**20
+
+
+def test_a_random_policy_does_not_pass_for_the_shipped_one(tmp_path: Path):
+    content = load_checkpoint(shipped_checkpoint("base"))
+    rng = torch.Generator().manual_seed(0)
+    content["model"] = {
+        k: torch.randn(v.shape, generator=rng) * 0.1 if k.startswith("actors") else v
+        for k, v in content["model"].items()
+    }
+    save_checkpoint(tmp_path / "random.pt", content)
+    result = run(tmp_path, "--checkpoint", str(tmp_path / "random.pt"))
+    assert result["metrics"]["fall_fraction"]["mean"] > 0.5
+
+
+def test_same_seed_same_json_but_for_seconds(tmp_path: Path):
+    short = ("--num-envs", "8", "--episode-seconds", "6")
+    first, second = (run(tmp_path, *short, name=f"{i}.json") for i in range(2))
+    other = run(tmp_path, *short, "--seed", "1", name="other.json")
+    for result in (first, second, other):
+        del result["seconds"]
+    assert first == second
+    assert first["metrics"] != other["metrics"]
+
+
+def test_loaded_policy_is_deterministic_and_reads_430_numbers():
+    policy = load_policy(shipped_checkpoint("base"))
+    obs = {"policy": torch.randn(3, 430)}
+    assert torch.equal(policy(obs), policy(obs))
+    assert policy(obs).shape == (3, 19)
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["velocity-trackin"], "velocity-tracking"),
+        ([*SMALL, "--num-envs", "0"], "num_envs"),
+        ([*SMALL, "--method", "magic"], "pd"),
+        ([*SMALL, "--speed-x", "nan"], "speed_x"),
+        ([*SMALL, "--checkpoint", "nowhere.pt"], "nowhere.pt"),
+        ([*SMALL, "--json", "no/such/folder/x.json"], "no/such/folder"),
+        ([*SMALL, "--torque-limit-scale", "-1"], "torque_limit_scale"),
+    ],
+)
+def test_bad_input_is_named(options: list[str], says: str, capsys: pytest.CaptureFixture[str]):
+    assert main(options) == 2
+    assert says in capsys.readouterr().err
+
+
+def test_plot_is_written(tmp_path: Path):
+    run(tmp_path, "--num-envs", "4", "--episode-seconds", "6", "--plot", str(tmp_path / "plot.png"))
+    assert (tmp_path / "plot.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_without_a_renderer_the_message_says_what_to_do(monkeypatch: pytest.MonkeyPatch):
+    import mujoco
+
+    def broken(*_: object) -> None:
+        raise RuntimeError("no GL")
+
+    monkeypatch.setattr(mujoco, "Renderer", broken)
+    with pytest.raises(RenderingUnavailable, match="MUJOCO_GL=osmesa"):
+        open_renderer(build_model(h1()), 64, 64)

@@ -1,0 +1,186 @@
+"""Measures on hand-made trajectories."""
+
+import json
+import math
+
+import pytest
+import torch
+
+from cotap.evaluation.metrics import (
+    masked_mean,
+    moving_average,
+    settled,
+    slope,
+    steps_since_change,
+    summarize,
+    swing_heights,
+    tracking_measures,
+    tracking_slopes,
+)
+from cotap.evaluation.report import table
+from cotap.evaluation.rollout import Trajectory
+
+DT = 0.02
+
+
+def trajectory(steps: int = 200, worlds: int = 2, **changes: torch.Tensor) -> Trajectory:
+    """Everyone walks at exactly the command (0.5, -0.2, 0.3), both feet on the ground; `changes` replace fields."""
+    command = torch.tensor([0.5, -0.2, 0.3]).expand(steps, worlds, 3).clone()
+    fields = {
+        "velocity": command.clone(),
+        "command": command,
+        "stand": torch.zeros(steps, worlds, dtype=torch.bool),
+        "height": torch.full((steps, worlds), 1.0),
+        "height_command": torch.full((steps, worlds), 1.0),
+        "position": torch.zeros(steps, worlds, 2),
+        "arm_error": torch.zeros(steps, worlds, 8),
+        "arm_torque": torch.zeros(steps, worlds, 8),
+        "hand_error": torch.zeros(steps, worlds, 2),
+        "foot_contact": torch.ones(steps, worlds, 2, dtype=torch.bool),
+        "foot_speed": torch.zeros(steps, worlds, 2),
+        "foot_height": torch.zeros(steps, worlds, 2),
+        "fell": torch.zeros(steps, worlds, dtype=torch.bool),
+    }
+    return Trajectory(dt=DT, **(fields | changes))
+
+
+def test_perfect_tracking_has_no_error():
+    m = tracking_measures(trajectory(), gait_period_s=0.8)
+    for name in ("e_lin", "e_lin_gait", "e_yaw", "e_yaw_gait", "e_height", "e_upper", "foot_slip", "fall_fraction"):
+        assert m[name].tolist() == pytest.approx([0.0, 0.0], abs=1e-6), name
+    assert m["episode_length_fraction"].tolist() == [1.0, 1.0]
+    assert m["stand_drift"].isnan().all()
+    assert m["swing_height"].isnan().all()
+
+
+def test_constant_errors_by_hand():
+    t = trajectory()
+    t.velocity[:, 0] += torch.tensor([0.3, -0.4, 0.25])  # norm 0.5
+    t.velocity[:, 1, 2] -= 0.1
+    t.height[:, 0] -= 0.03
+    t.arm_error[:, 1, :4] = 0.1  # norm 0.2
+    t.arm_torque[:, 0, 0], t.arm_torque[:, 0, 1] = 3.0, 4.0
+    t.hand_error[:, 0, 0] = 0.2
+    m = tracking_measures(t, 0.8)
+    assert m["e_lin"].tolist() == pytest.approx([0.5, 0.0], abs=1e-5)
+    assert m["e_lin_gait"].tolist() == pytest.approx([0.5, 0.0], abs=1e-5)
+    assert m["e_yaw"].tolist() == pytest.approx([0.25, 0.1], abs=1e-5)
+    assert m["e_height"].tolist() == pytest.approx([0.03, 0.0], abs=1e-5)
+    assert m["e_upper"].tolist() == pytest.approx([0.0, 0.2], abs=1e-5)
+    assert m["j_upper"].tolist() == pytest.approx([5.0, 0.0], abs=1e-5)
+    assert m["e_ee"].tolist() == pytest.approx([0.1, 0.0], abs=1e-5)
+
+
+def test_gait_average_removes_what_oscillates_with_the_stride():
+    t = trajectory()
+    sway = 0.3 * torch.sin(2.0 * math.pi * torch.arange(200) / 40)  # 40 steps: one period of 0.8 s
+    t.velocity[:, 0, 0] += sway
+    m = tracking_measures(t, 0.8)
+    assert m["e_lin_gait"][0] == pytest.approx(0.0, abs=1e-5)
+    assert m["e_lin"][0] == pytest.approx(0.3 * 2.0 / math.pi, rel=0.02)
+
+
+def test_errors_are_taken_only_once_a_command_has_settled():
+    t = trajectory()
+    t.command[100:, 0, 0] = -0.5
+    t.velocity[100:150, 0, 0], t.velocity[150:, 0, 0] = 0.5, -0.5  # follows exactly 1 s late
+    assert tracking_measures(t, 0.8, settle_s=1.0)["e_lin"][0] == pytest.approx(0.0, abs=1e-6)
+    late = tracking_measures(t, 0.8, settle_s=0.9)["e_lin"][0]
+    assert late == pytest.approx(1.0 * 5 / (55 + 55), rel=1e-4)  # 45 steps of settling, twice
+    ok = settled(t, 1.0)
+    assert ok[:, 0].nonzero().squeeze(1).tolist() == [*range(50, 100), *range(150, 200)]
+
+
+def test_measures_end_with_the_fall_and_never_include_what_follows():
+    t = trajectory()
+    t.fell[120, 0] = True
+    t.velocity[120:, 0] = 99.0
+    t.arm_error[120:, 0] = 99.0
+    m = tracking_measures(t, 0.8)
+    assert m["e_lin"][0] == pytest.approx(0.0, abs=1e-6)
+    assert m["e_upper"][0] == pytest.approx(0.0, abs=1e-6)
+    assert m["fall_fraction"].tolist() == [1.0, 0.0]
+    assert m["episode_length_fraction"].tolist() == pytest.approx([0.6, 1.0])
+
+
+def test_stand_drift_is_the_mean_velocity_not_the_sway():
+    t = trajectory(command=torch.zeros(200, 2, 3), stand=torch.ones(200, 2, dtype=torch.bool))
+    t.velocity.zero_()
+    t.velocity[:, 0, 1] = 0.04
+    t.velocity[:, 1, 0] = 0.2 * torch.sin(2.0 * math.pi * torch.arange(200) / 40)
+    assert tracking_measures(t, 0.8)["stand_drift"].tolist() == pytest.approx([0.04, 0.0], abs=1e-5)
+
+
+def test_slip_counts_only_feet_in_contact():
+    t = trajectory()
+    t.foot_speed[:, 0, 0], t.foot_speed[:, 0, 1] = 0.1, 5.0
+    t.foot_contact[:, 0, 1] = False
+    assert tracking_measures(t, 0.8)["foot_slip"][0] == pytest.approx(0.1, rel=1e-4)
+
+
+def test_swing_height_is_the_mean_of_the_peaks_of_true_swings():
+    contact = torch.ones(60, 1, 2, dtype=torch.bool)
+    height = torch.zeros(60, 1, 2)
+    contact[10:20, 0, 0] = False
+    height[10:20, 0, 0] = torch.tensor([0.01, 0.03, 0.05, 0.08, 0.1, 0.1, 0.08, 0.05, 0.03, 0.01])
+    contact[30:40, 0, 1] = False
+    height[30:40, 0, 1] = 0.06
+    contact[45:47, 0, 0] = False  # chatter
+    height[45:47, 0, 0] = 0.5
+    counted = torch.ones(60, 1, dtype=torch.bool)
+    assert swing_heights(height, contact, counted, 5)[0] == pytest.approx(0.08, rel=1e-5)
+    counted[25:] = False
+    assert swing_heights(height, contact, counted, 5)[0] == pytest.approx(0.1, rel=1e-5)
+
+
+def test_slopes_are_those_of_least_squares():
+    commanded, noise = torch.linspace(-1, 1, 500), torch.randn(500, generator=torch.Generator().manual_seed(0))
+    measured = 0.9 * commanded + 0.05 + 0.1 * noise
+    import numpy as np
+
+    expected = np.polyfit(commanded.numpy(), measured.numpy(), 1)[0]
+    everything = torch.ones(500, dtype=torch.bool)
+    assert slope(commanded, measured, everything) == pytest.approx(expected, rel=1e-4)
+    assert math.isnan(slope(torch.ones(500), measured, everything))
+    t = trajectory(worlds=3)
+    t.command[..., 0] = torch.tensor([-1.0, 0.0, 1.0])
+    t.velocity[..., 0] = 0.8 * t.command[..., 0]
+    assert tracking_slopes(t, 0.8)["slope_x"] == pytest.approx(0.8, rel=1e-4)
+
+
+def test_moving_average_against_a_plain_loop():
+    x = torch.randn(50, 3, generator=torch.Generator().manual_seed(1))
+    expected = torch.stack([x[max(0, i - 6) : i + 1].mean(0) for i in range(50)])
+    assert torch.allclose(moving_average(x, 7), expected, atol=1e-5)
+
+
+def test_steps_since_change():
+    x = torch.tensor([1.0, 1.0, 2.0, 2.0, 2.0, 1.0]).reshape(6, 1, 1)
+    assert steps_since_change(x).squeeze().tolist() == [0, 1, 0, 1, 2, 0]
+
+
+def test_masked_mean_is_nan_where_nothing_was_measured():
+    mask = torch.tensor([[True, False], [True, False]])
+    result = masked_mean(torch.tensor([[1.0, 5.0], [3.0, 5.0]]), mask)
+    assert result[0] == 2.0
+    assert result[1].isnan()
+
+
+def test_summary_interval_covers_the_mean_at_its_stated_rate():
+    rng = torch.Generator().manual_seed(0)
+    hits = 0
+    for trial in range(100):
+        low, high = summarize(torch.randn(80, generator=rng) + 1.0, seed=trial, resamples=300)["ci95"]
+        hits += low <= 1.0 <= high
+    assert 87 <= hits <= 100
+    s = summarize(torch.tensor([1.0, 3.0, math.nan]))
+    assert (s["mean"], s["std"]) == (2.0, pytest.approx(math.sqrt(2.0)))
+
+
+def test_what_cannot_be_measured_is_null_with_a_reason():
+    s = summarize(torch.tensor([math.nan]))
+    assert s["mean"] is None
+    assert s["reason"]
+    result = {"protocol": "p", "method": "m", "num_falls": 0, "num_envs": 1, "seconds": 1.0, "metrics": {"e_lin": s}}
+    assert "no world" in table(result)
+    json.dumps(s, allow_nan=False)
