@@ -1,0 +1,73 @@
+"""What the physics step costs in accuracy and buys in speed: joint PD of H1 under random targets, against 0.5 ms.
+
+Prints a Markdown table. `explicit` computes the torque before every physics step; `implicit` lets MuJoCo's actuators
+add the damping inside its implicit integrator, as the environment does.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+
+import numpy as np
+from mjbatch import Batch
+
+from cotap.robots import h1
+from cotap.robots.mjcf import build_model
+
+CONTROL_DT = 0.02
+KP, KD, DEFAULT = (np.array([getattr(j, name) for j in h1().joints]) for name in ("kp", "kd", "default_rad"))
+
+
+def simulate(timestep_s: float, implicit: bool, targets: np.ndarray) -> tuple[np.ndarray, float]:
+    """Joint angles (T, N, J) after every control step under `targets` (T, N, J), and seconds spent stepping."""
+    steps, worlds, _ = targets.shape
+    model = build_model(h1(), "feet", timestep_s)
+    if not implicit:
+        model.actuator_biasprm[:] = 0.0
+    batch = Batch(model, worlds)
+    qpos, qvel, ctrl = (batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
+    qpos[:, 2], qpos[:, 7:] = h1().nominal_height_m, DEFAULT
+    out = np.empty_like(targets)
+    spent = 0.0
+    for t in range(steps):
+        for _ in range(round(CONTROL_DT / timestep_s)):
+            damping = 0.0 if implicit else KP * qpos[:, 7:] + KD * qvel[:, 6:]
+            ctrl[:] = KP * targets[t] - damping
+            start = time.perf_counter()
+            batch.step()
+            spent += time.perf_counter() - start
+        out[t] = qpos[:, 7:]
+    return out, spent
+
+
+def main() -> int:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--worlds", type=int, default=256)
+    parser.add_argument("--seconds", type=float, default=0.5)
+    parser.add_argument(
+        "--spread", type=float, default=0.15, help="standard deviation of targets about the default [rad]"
+    )
+    options = parser.parse_args()
+    rng = np.random.default_rng(0)
+    steps = round(options.seconds / CONTROL_DT)
+    # Targets hold for five control steps, so that joints have time to go somewhere.
+    draws = rng.normal(size=(-(-steps // 5), options.worlds, len(DEFAULT))) * options.spread
+    targets = DEFAULT + np.repeat(draws, 5, axis=0)[:steps]
+    reference, _ = simulate(0.0005, True, targets)
+    print("| step | torque | rms error, mean over joints [rad] | worst joint [rad] | control steps/s, relative |")
+    print("|---|---|---|---|---|")
+    base = None
+    for timestep_s, implicit in ((0.005, False), (0.005, True), (0.01, False), (0.01, True)):
+        angles, spent = simulate(timestep_s, implicit, targets)
+        rms = np.sqrt(np.mean((angles - reference) ** 2, axis=(0, 1)))
+        base = base or spent
+        kind = "implicit" if implicit else "explicit"
+        print(f"| {1e3 * timestep_s:g} ms | {kind} | {rms.mean():.4f} | {rms.max():.4f} | {base / spent:.2f} |")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
