@@ -1,0 +1,365 @@
+"""The training loop: it goes on exactly where it stopped, however it stopped, and refuses what it cannot go on from."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import dummy_env
+import pytest
+import torch
+from dummy_env import DummyEnv, make_runner
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from cotap.agents.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
+from cotap.agents.runner import DualRunner, RunnerConfig, check_run_dir
+from cotap.envs import H1Env, H1EnvConfig
+from cotap.envs.observations import NoiseConfig, ObservationConfig
+from cotap.envs.terminations import TerminationConfig
+
+STEPS = dummy_env.TINY["steps"]
+WORLDS = 8
+
+
+def dummy() -> DummyEnv:
+    return DummyEnv(WORLDS)
+
+
+def robots() -> H1Env:
+    """Episodes so short that resets of every kind happen in a few iterations."""
+    return H1Env(
+        H1EnvConfig(
+            num_envs=WORLDS,
+            num_threads=1,
+            terminations=TerminationConfig(episode_s=0.3),
+            observations=ObservationConfig(noise=NoiseConfig(enabled=True)),
+        )
+    )
+
+
+def checkpoint(run_dir: Path, iteration: int) -> Path:
+    return run_dir / f"checkpoint_{iteration:06d}.pt"
+
+
+def names(run_dir: Path) -> list[str]:
+    """Checkpoints and whatever else is no log."""
+    return sorted(n for n in os.listdir(run_dir) if not n.startswith("events."))
+
+
+def assert_same(a: Any, b: Any, where: str = "") -> None:
+    """Nested data are equal, tensors bit for bit."""
+    assert type(a) is type(b), where
+    if isinstance(a, dict):
+        assert a.keys() == b.keys(), where
+        for key in a:
+            assert_same(a[key], b[key], f"{where}/{key}")
+    elif isinstance(a, list):
+        assert len(a) == len(b), where
+        for i, (x, y) in enumerate(zip(a, b, strict=True)):
+            assert_same(x, y, f"{where}/{i}")
+    elif isinstance(a, torch.Tensor):
+        assert a.dtype == b.dtype, where
+        assert torch.equal(a, b), where
+    else:
+        assert a == b, where
+
+
+def assert_same_run(a: Path, b: Path) -> None:
+    """Two checkpoints hold the same but for the time it took."""
+    contents = [load_checkpoint(p) for p in (a, b)]
+    for content in contents:
+        del content["wall_seconds"]
+    assert_same(*contents)
+
+
+def weights(runner: DualRunner) -> dict[str, torch.Tensor]:
+    return {k: v.clone() for k, v in runner.alg.model.state_dict().items()}
+
+
+@pytest.mark.parametrize("make_world", [dummy, robots])
+@pytest.mark.parametrize("stop", [1, 3])
+def test_resumed_run_ends_bit_for_bit_where_a_straight_one_does(
+    tmp_path: Path, make_world: Callable[[], Any], stop: int
+):
+    straight = make_runner(tmp_path / "straight", 5, env=make_world())
+    start = weights(straight)
+    straight.learn(init_at_random_ep_len=True)
+    make_runner(tmp_path / "parts", stop, env=make_world()).learn(init_at_random_ep_len=True)
+    # Another seed: everything must come from the file.
+    resumed = make_runner(tmp_path / "parts", 5, seed=99, env=make_world())
+    resumed.load(str(checkpoint(tmp_path / "parts", stop)))
+    assert resumed.current_learning_iteration == stop
+    assert resumed.env.samples == stop * STEPS * WORLDS
+    resumed.learn(init_at_random_ep_len=True)
+    assert_same_run(checkpoint(tmp_path / "straight", 5), checkpoint(tmp_path / "parts", 5))
+    assert any(not torch.equal(v, start[k]) for k, v in weights(resumed).items())
+
+
+def test_saving_does_not_disturb_a_run(tmp_path: Path):
+    for interval in (1, 100):
+        make_runner(tmp_path / str(interval), 4, save_interval=interval, env=robots()).learn()
+    assert_same_run(checkpoint(tmp_path / "1", 4), checkpoint(tmp_path / "100", 4))
+
+
+def test_checkpoints_come_at_intervals_and_at_the_end(tmp_path: Path):
+    make_runner(tmp_path, 5, save_interval=2).learn()
+    expected = [f"checkpoint_{i:06d}.pt" for i in (2, 4, 5)]
+    assert names(tmp_path) == [*expected, "config.json"]
+    assert [load_checkpoint(tmp_path / n)["iteration"] for n in expected] == [2, 4, 5]
+    assert [load_checkpoint(tmp_path / n)["samples"] for n in expected] == [i * STEPS * WORLDS for i in (2, 4, 5)]
+
+
+def test_only_the_newest_checkpoint_keeps_simulator_states(tmp_path: Path):
+    make_runner(tmp_path, 6, save_interval=2).learn()
+    older = [load_checkpoint(checkpoint(tmp_path, i)) for i in (2, 4)]
+    newest = load_checkpoint(checkpoint(tmp_path, 6))
+    assert newest["env"]["episode_length"].shape == (WORLDS,)
+    for content in older:
+        assert content["env"] == {}
+        assert content["learner"]["optimizers"].keys() == {"lower", "upper"}
+        assert not torch.equal(
+            content["model"]["actors.lower.mlp.0.weight"], newest["model"]["actors.lower.mlp.0.weight"]
+        )
+
+
+def test_an_older_checkpoint_goes_on_with_fresh_worlds(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    make_runner(tmp_path / "a", 4, save_interval=2).learn()
+    runner = make_runner(tmp_path / "b", 3)
+    runner.load(str(checkpoint(tmp_path / "a", 2)))
+    assert "no simulator states" in "".join(capsys.readouterr())
+    assert runner.env.samples == 2 * STEPS * WORLDS
+    runner.learn()
+    assert names(tmp_path / "b") == ["checkpoint_000003.pt", "config.json"]
+
+
+def test_another_number_of_worlds_goes_on_with_fresh_ones(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    make_runner(tmp_path / "a", 2).learn()
+    runner = make_runner(tmp_path / "b", 3, env=DummyEnv(16))
+    runner.load(str(checkpoint(tmp_path / "a", 2)))
+    assert "no simulator states" in "".join(capsys.readouterr())
+    runner.learn()
+    content = load_checkpoint(checkpoint(tmp_path / "b", 3))
+    assert content["samples"] == 2 * STEPS * WORLDS + STEPS * 16
+    assert content["iteration"] == 3
+
+
+def test_a_checkpoint_of_weights_alone_starts_a_new_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    make_runner(tmp_path / "a", 2).learn()
+    content = load_checkpoint(checkpoint(tmp_path / "a", 2))
+    save_checkpoint(tmp_path / "shipped.pt", content | {"learner": {}, "env": {}})
+    runner = make_runner(tmp_path / "b", 1, seed=5)
+    runner.load(str(tmp_path / "shipped.pt"))
+    assert "no optimisers and simulator states" in "".join(capsys.readouterr())
+    assert runner.current_learning_iteration == 0
+    assert_same(dict(weights(runner)), dict(content["model"]))
+
+
+def test_infos_come_back(tmp_path: Path):
+    runner = make_runner(tmp_path, 1)
+    runner.save(str(tmp_path / "own.pt"), {"note": "kept"})
+    assert make_runner(tmp_path, 1).load(str(tmp_path / "own.pt")) == {"note": "kept"}
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT], ids=lambda n: n.name)
+def test_a_signal_ends_the_run_after_its_iteration_and_loses_nothing(tmp_path: Path, number: signal.Signals):
+    before = [signal.getsignal(n) for n in (signal.SIGTERM, signal.SIGINT)]
+    runner = make_runner(tmp_path / "stopped", 5, save_interval=100)
+    runner.env.on_step = lambda step: signal.raise_signal(number) if step == 2 * STEPS + 1 else None
+    runner.learn()
+    assert [signal.getsignal(n) for n in (signal.SIGTERM, signal.SIGINT)] == before
+    assert names(tmp_path / "stopped") == ["checkpoint_000003.pt", "config.json"]
+    resumed = make_runner(tmp_path / "stopped", 5, save_interval=100, seed=9)
+    resumed.load(str(checkpoint(tmp_path / "stopped", 3)))
+    resumed.learn()
+    make_runner(tmp_path / "straight", 5, save_interval=100).learn()
+    assert_same_run(checkpoint(tmp_path / "stopped", 5), checkpoint(tmp_path / "straight", 5))
+
+
+def test_a_stopped_runner_can_be_told_to_go_on(tmp_path: Path):
+    runner = make_runner(tmp_path, 5, save_interval=100)
+    runner.env.on_step = lambda step: signal.raise_signal(signal.SIGTERM) if step == 0 else None
+    runner.learn()
+    assert runner.current_learning_iteration == 1
+    runner.learn()
+    assert runner.current_learning_iteration == 5
+
+
+def test_a_second_signal_ends_the_run_at_once(tmp_path: Path):
+    before = signal.getsignal(signal.SIGTERM)
+    runner = make_runner(tmp_path, 5, save_interval=1)
+    runner.env.on_step = lambda step: signal.raise_signal(signal.SIGTERM) if step >= STEPS else None
+    with pytest.raises(KeyboardInterrupt):
+        runner.learn()
+    assert runner.env.steps == STEPS + 1
+    assert signal.getsignal(signal.SIGTERM) == before
+    assert names(tmp_path) == ["checkpoint_000001.pt", "config.json"]
+    load_checkpoint(checkpoint(tmp_path, 1))
+
+
+def test_a_signal_does_not_cut_the_last_save_short(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Whoever handles signals outside a run must not get one while the run still saves."""
+    outside: list[int] = []
+    before = signal.signal(signal.SIGTERM, lambda number, _frame: outside.append(number))
+    try:
+        runner = make_runner(tmp_path, 1, save_interval=100)
+        save = runner.save
+
+        def save_under_fire() -> None:
+            signal.raise_signal(signal.SIGTERM)
+            save()
+
+        monkeypatch.setattr(runner, "save", save_under_fire)
+        runner.learn()
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert outside == []
+    load_checkpoint(checkpoint(tmp_path, 1))
+
+
+def test_a_run_killed_outright_loses_at_most_one_interval(tmp_path: Path):
+    """`kill -9` in the sixth iteration of a run that saves every second one."""
+    killed = tmp_path / "killed"
+    command = [sys.executable, dummy_env.__file__, str(killed), "8", str(int(signal.SIGKILL)), str(5 * STEPS + 3)]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=600)
+    assert result.returncode == -signal.SIGKILL, result.stderr
+    newest = max(killed.glob("checkpoint_*.pt"))
+    assert newest == checkpoint(killed, 4)
+    resumed = make_runner(killed, 8, seed=9)
+    resumed.load(str(newest))
+    resumed.learn()
+    make_runner(tmp_path / "straight", 8).learn(init_at_random_ep_len=True)
+    assert_same_run(checkpoint(killed, 8), checkpoint(tmp_path / "straight", 8))
+
+
+def test_logs_of_a_resumed_run_are_one_curve(tmp_path: Path):
+    for iterations in (3, 5):
+        runner = make_runner(tmp_path, iterations)
+        if iterations == 5:
+            runner.load(str(checkpoint(tmp_path, 3)))
+        runner.learn()
+    logs = EventAccumulator(str(tmp_path))
+    logs.Reload()
+    tags = logs.Tags()["scalars"]
+    assert {"lower/target", "upper/target", "agents/lower/kl", "agents/upper/action_std"} <= set(tags)
+    assert "throughput/steps_per_s" in tags
+    for tag in tags:
+        assert [e.step for e in logs.Scalars(tag)] == [STEPS * WORLDS * i for i in (1, 2, 3, 4, 5)], tag
+
+
+def test_logged_rewards_are_means_over_the_iteration(tmp_path: Path):
+    runner = make_runner(tmp_path, 1)
+    seen: list[float] = []
+    step = runner.env.step
+
+    def spy(actions: torch.Tensor) -> Any:
+        result = step(actions)
+        seen.append(float(result[3]["group_rewards"][:, 1].mean()))
+        return result
+
+    runner.env.step = spy
+    runner.learn()
+    logs = EventAccumulator(str(tmp_path))
+    logs.Reload()
+    assert len(seen) == STEPS
+    assert logs.Scalars("upper/target")[0].value == pytest.approx(sum(seen) / STEPS, rel=1e-5)
+
+
+@pytest.mark.parametrize("content", [b"", b"rubbish" * 50_000])
+def test_an_unreadable_older_checkpoint_does_not_end_a_run(tmp_path: Path, content: bytes):
+    tmp_path.joinpath("checkpoint_000000.pt").write_bytes(content)
+    make_runner(tmp_path, 2).learn()
+    assert load_checkpoint(checkpoint(tmp_path, 2))["iteration"] == 2
+    assert tmp_path.joinpath("checkpoint_000000.pt").read_bytes() == content
+
+
+def test_a_full_disk_ends_the_run_and_keeps_what_was_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    runner = make_runner(tmp_path, 6, save_interval=2)
+    real, calls = torch.save, []
+
+    def save(content: Any, path: Any) -> None:
+        calls.append(content["iteration"])
+        if content["iteration"] > 2:
+            Path(path).write_bytes(b"part")
+            raise RuntimeError("PytorchStreamWriter failed writing file")
+        real(content, path)
+
+    monkeypatch.setattr(torch, "save", save)
+    with pytest.raises(OSError, match=r"checkpoint_000004.*failed writing"):
+        runner.learn()
+    assert names(tmp_path) == ["checkpoint_000002.pt", "config.json"]
+    assert load_checkpoint(checkpoint(tmp_path, 2))["env"] != {}
+
+
+def test_a_checkpoint_of_another_robot_is_refused_and_changes_nothing(tmp_path: Path):
+    make_runner(tmp_path, 1).learn()
+    runner = make_runner(tmp_path / "b", 1, seed=3, env=DummyEnv(robot="other"))
+    before = weights(runner)
+    with pytest.raises(CheckpointError, match="trained with another robot: 'dummy', here 'other'"):
+        runner.load(str(checkpoint(tmp_path, 1)))
+    assert_same(weights(runner), before)
+    assert runner.current_learning_iteration == 0
+
+
+def test_a_checkpoint_of_another_observation_layout_is_refused(tmp_path: Path):
+    make_runner(tmp_path, 1, env=robots()).learn()
+    other = H1Env(H1EnvConfig(num_envs=WORLDS, num_threads=1, observations=ObservationConfig(history=3)))
+    with pytest.raises(CheckpointError, match="another history: 5, here 3"):
+        make_runner(tmp_path / "b", 1, env=other).load(str(checkpoint(tmp_path, 1)))
+
+
+def test_a_checkpoint_of_other_networks_is_refused(tmp_path: Path):
+    make_runner(tmp_path, 1).learn()
+    with pytest.raises(CheckpointError, match=r"checkpoint_000001.pt' has other networks"):
+        make_runner(tmp_path / "b", 1, hidden=(16, 8)).load(str(checkpoint(tmp_path, 1)))
+
+
+@pytest.mark.parametrize("missing", ["layout", "model", "learner", "env", "samples"])
+def test_a_checkpoint_that_lacks_a_part_is_refused_by_name(tmp_path: Path, missing: str):
+    make_runner(tmp_path, 1).learn()
+    content = load_checkpoint(checkpoint(tmp_path, 1))
+    del content[missing]
+    save_checkpoint(tmp_path / "odd.pt", content)
+    with pytest.raises(CheckpointError, match=missing):
+        make_runner(tmp_path / "b", 1).load(str(tmp_path / "odd.pt"))
+
+
+def test_a_used_run_directory_is_refused_with_what_to_do(tmp_path: Path):
+    make_runner(tmp_path, 4, save_interval=2).learn()
+    before = names(tmp_path)
+    with pytest.raises(ValueError, match="already holds a run") as error:
+        check_run_dir(tmp_path, resuming=False)
+    assert f"--resume {checkpoint(tmp_path, 4)}" in str(error.value)
+    assert "--run-dir" in str(error.value)
+    check_run_dir(tmp_path, resuming=True)
+    assert names(tmp_path) == before
+
+
+def test_a_new_run_directory_is_made_and_left_empty(tmp_path: Path):
+    check_run_dir(tmp_path / "new" / "run", resuming=False)
+    assert names(tmp_path / "new" / "run") == []
+
+
+def test_a_run_directory_that_cannot_be_is_refused(tmp_path: Path):
+    file = tmp_path / "file"
+    file.write_text("mine")
+    with pytest.raises(ValueError, match="is a file") as error:
+        check_run_dir(file, resuming=False)
+    assert repr(str(file)) in str(error.value)
+    with pytest.raises(OSError, match="file"):
+        check_run_dir(file / "run", resuming=False)
+    with pytest.raises(OSError, match="nowhere"):
+        check_run_dir(Path("/proc/nowhere/run"), resuming=False)
+    assert file.read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("iterations", 0), ("iterations", -3), ("save_interval", 0), ("save_interval", 2.5)]
+)
+def test_bad_durations_are_named(field: str, value: Any):
+    with pytest.raises(ValueError, match=f"runner.{field} must be a positive integer, got {value}"):
+        RunnerConfig(**{field: value}).check()

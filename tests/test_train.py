@@ -1,0 +1,334 @@
+"""The training command: what it refuses, what it leaves behind, and what it goes on from."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import signal
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from cotap import train
+from cotap.agents.checkpoint import load_checkpoint, save_checkpoint
+from cotap.configs import BASE_RECIPES
+from cotap.envs import H1Env
+from cotap.envs.rewards import LowerRewards, UpperRewards
+
+# Every option that these tests use, as typed on the command line.
+ENVS = "--num-envs"
+ITERATIONS = "--iterations"
+SEED = "--seed"
+THREADS = "--threads"
+DEVICE = "--device"
+RUN_DIR = "--run-dir"
+RESUME = "--resume"
+RECIPE = "--recipe"
+SAVE_INTERVAL = "--runner.save-interval"
+HIDDEN = "--ppo.hidden"
+STEPS = "--ppo.steps"
+PRECISION = "--ppo.precision"
+GAMMA = "--ppo.gamma"
+LAM = "--ppo.lam"
+ROBOT = "--env.robot"
+COLLISION = "--env.collision"
+CONTROL_DT = "--env.control-dt"
+VELOCITY_X = "--env.commands.velocity-x"
+REACH = "--env.motions.reach"
+EPISODE = "--env.terminations.episode-s"
+REWARD = "--env.rewards.lower.track-velocity"
+HISTORY = "--env.observations.history"
+
+SMALL = [ENVS, "8", ITERATIONS, "2", THREADS, "1", HIDDEN, "8", "8", STEPS, "6", PRECISION, "fp32"]
+
+
+def run(*args: Any) -> int:
+    """Exit status, whether returned or raised (as the parser does)."""
+    try:
+        return train.main([str(a) for a in args])
+    except SystemExit as stop:
+        return int(stop.code or 0)
+
+
+def run_small(run_dir: Path, *options: Any) -> dict[str, Any]:
+    """Train for two tiny iterations and return the last checkpoint's content."""
+    assert run("base", *SMALL, RUN_DIR, run_dir, *options) == 0
+    return newest(run_dir)
+
+
+def newest(run_dir: Path) -> dict[str, Any]:
+    return load_checkpoint(max(run_dir.glob("checkpoint_*.pt")))
+
+
+def tree(folder: Path) -> dict[str, bytes]:
+    """Every file below a folder with its content, and every folder."""
+    return {str(p.relative_to(folder)): p.read_bytes() if p.is_file() else b"" for p in sorted(folder.rglob("*"))}
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a finished tiny run, to look at only."""
+    folder = tmp_path_factory.mktemp("runs") / "base"
+    run_small(folder, GAMMA, 0.9)
+    return folder
+
+
+@pytest.fixture
+def checkpoint(base: Path, tmp_path: Path) -> Path:
+    """A copy of its checkpoint, in a folder of its own."""
+    target = tmp_path / "first" / "checkpoint_000002.pt"
+    target.parent.mkdir()
+    target.write_bytes((base / target.name).read_bytes())
+    return target
+
+
+BAD = [
+    ([ENVS, 0], ["num_envs", "got 0"]),
+    ([ENVS, -3], ["num_envs", "got -3"]),
+    ([f"{ENVS}=-3"], ["num_envs", "got -3"]),
+    ([ENVS, "many"], ["many"]),
+    ([ITERATIONS, 0], ["runner.iterations", "got 0"]),
+    ([SAVE_INTERVAL, -1], ["runner.save_interval", "got -1"]),
+    ([THREADS, -2], ["threads", "-2"]),
+    ([DEVICE, "abacus"], ["device", "abacus"]),
+    ([RECIPE, "papr"], ["'papr'", "did you mean 'paper'", "default"]),
+    ([f"{RECIPE}=papr"], ["'papr'", "did you mean 'paper'", "default"]),
+    ([GAMMA, "nan"], ["ppo.gamma", "nan"]),
+    ([GAMMA, 1.5], ["ppo.gamma", "1.5"]),
+    ([HIDDEN, 8, 0], ["ppo.hidden[1]", "got 0"]),
+    ([STEPS, 0], ["ppo.steps", "got 0"]),
+    ([PRECISION, "fp8"], ["precision", "'fp8'", "auto, bf16, fp32"]),
+    ([ROBOT, "h2"], ["robot", "'h2'", "known: h1"]),
+    ([COLLISION, "foot"], ["collision", "'foot'", "feet", "full"]),
+    ([CONTROL_DT, "nan"], ["control_dt", "nan"]),
+    ([CONTROL_DT, 0], ["control_dt", "got 0.0"]),
+    ([VELOCITY_X, "nan", 1], ["commands.velocity_x[0]", "nan"]),
+    ([VELOCITY_X, 1, -1], ["commands.velocity_x", "(1.0, -1.0)"]),
+    ([REACH, "inf"], ["motions.reach", "inf"]),
+    ([EPISODE, "nan"], ["terminations.episode_s", "nan"]),
+    ([REWARD, "nan"], ["rewards.lower.track_velocity", "nan"]),
+    ([HISTORY, 0], ["observations.history", "got 0"]),
+    (["--no-such-option", 1], ["no-such-option"]),
+]
+
+
+@pytest.mark.parametrize(("options", "needles"), BAD, ids=[" ".join(map(str, o)) for o, _ in BAD])
+def test_bad_options_are_named_and_leave_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[Any], needles: list[str]
+):
+    before = os.getcwd()
+    assert run("base", *SMALL, RUN_DIR, tmp_path / "run", *options) == 2
+    message = capsys.readouterr().err
+    for needle in needles:
+        assert needle in message
+    assert "Traceback" not in message
+    assert tree(tmp_path) == {}
+    assert os.getcwd() == before
+
+
+def test_unknown_stage_is_named_with_the_known_ones(capsys: pytest.CaptureFixture[str]):
+    assert run("bse", *SMALL) == 2
+    assert "stage 'bse' is unknown (did you mean 'base'?)" in capsys.readouterr().err
+
+
+def test_help_names_the_options(capsys: pytest.CaptureFixture[str]):
+    assert run("base", "--help") == 0
+    text = capsys.readouterr().out
+    for option in (ENVS, ITERATIONS, SEED, RUN_DIR, RESUME, RECIPE, GAMMA, VELOCITY_X, REWARD):
+        assert option in text, option
+
+
+def damaged(checkpoint: Path, kind: str) -> tuple[Path, list[str]]:
+    """A checkpoint that cannot be resumed, and what the error must say besides its path."""
+    content = load_checkpoint(checkpoint)
+    path = checkpoint.with_name("damaged.pt")
+    if kind == "missing":
+        return path, ["does not exist"]
+    if kind == "folder":
+        return checkpoint.parent, ["does not exist"]
+    if kind == "truncated":
+        path.write_bytes(checkpoint.read_bytes()[:-1000])
+        return path, ["truncated"]
+    if kind == "foreign":
+        path.write_text("not a checkpoint")
+        return path, ["foreign"]
+    if kind == "state dict":
+        torch.save({"weight": torch.zeros(2)}, path)
+        return path, ["is not a cotap checkpoint"]
+    if kind == "version":
+        torch.save(content | {"version": 99}, path)
+        return path, ["99"]
+    if kind == "robot":
+        save_checkpoint(path, content | {"layout": content["layout"] | {"robot": "g1"}})
+        return path, ["another robot", "'g1'", "'h1'"]
+    if kind == "field":
+        training = content["config"]["training"]
+        save_checkpoint(path, content | {"config": {"training": training | {"colour": 1}}})
+        return path, ["no field 'colour'"]
+    assert kind == "no config"
+    save_checkpoint(path, {k: v for k, v in content.items() if k != "config"})
+    return path, ["config"]
+
+
+@pytest.mark.parametrize(
+    "kind", ["missing", "folder", "truncated", "foreign", "state dict", "version", "robot", "field", "no config"]
+)
+def test_a_checkpoint_that_cannot_be_resumed_is_named_and_leaves_nothing(
+    checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str
+):
+    path, needles = damaged(checkpoint, kind)
+    before = tree(tmp_path)
+    assert run("base", RESUME, path, RUN_DIR, tmp_path / "run", ITERATIONS, 3) == 2
+    message = capsys.readouterr().err
+    for needle in (*needles, path.name):
+        assert needle in message
+    assert tree(tmp_path) == before
+
+
+def test_another_observation_layout_is_refused(
+    checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    before = tree(tmp_path)
+    assert run("base", RESUME, checkpoint, RUN_DIR, tmp_path / "run", ITERATIONS, 3, HISTORY, 4) == 2
+    assert "another history: 5, here 4" in capsys.readouterr().err
+    assert tree(tmp_path) == before
+
+
+def test_other_networks_are_refused(checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    before = tree(tmp_path)
+    assert run("base", RESUME, checkpoint, RUN_DIR, tmp_path / "run", ITERATIONS, 3, HIDDEN, 16) == 2
+    assert "other networks" in capsys.readouterr().err
+    assert tree(tmp_path) == before
+
+
+def test_a_used_run_directory_is_refused_with_what_to_do(checkpoint: Path, capsys: pytest.CaptureFixture[str]):
+    before = tree(checkpoint.parent)
+    assert run("base", *SMALL, RUN_DIR, checkpoint.parent) == 2
+    message = capsys.readouterr().err
+    assert f"--resume {checkpoint}" in message
+    assert "another --run-dir" in message
+    assert tree(checkpoint.parent) == before
+
+
+def test_resuming_into_the_directory_of_a_third_run_is_refused(
+    base: Path, checkpoint: Path, capsys: pytest.CaptureFixture[str]
+):
+    before = tree(checkpoint.parent)
+    first = base / checkpoint.name
+    assert run("base", RESUME, first, RUN_DIR, checkpoint.parent, ITERATIONS, 3) == 2
+    assert "already holds a run" in capsys.readouterr().err
+    assert tree(checkpoint.parent) == before
+
+
+@pytest.mark.parametrize("below", ["", "run"])
+def test_a_run_directory_that_cannot_be_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], below: str
+):
+    file = tmp_path / "file"
+    file.write_text("mine")
+    assert run("base", *SMALL, RUN_DIR, file / below) == 2
+    assert str(file) in capsys.readouterr().err
+    assert tree(tmp_path) == {"file": b"mine"}
+
+
+def test_a_run_leaves_config_checkpoint_and_logs(base: Path):
+    assert sorted(p.name.split(".")[0] for p in base.iterdir()) == ["checkpoint_000002", "config", "events"]
+    config = json.loads((base / "config.json").read_text())
+    assert config["stage"] == "base"
+    assert config["training"]["ppo"]["gamma"] == 0.9
+    assert config["training"]["env"]["num_envs"] == 8
+    assert GAMMA in config["command"]
+    assert {"commit", "machine"} <= config.keys()
+    content = newest(base)
+    assert content["config"] == config
+    assert (content["iteration"], content["samples"]) == (2, 2 * 6 * 8)
+    assert content["layout"]["robot"] == "h1"
+
+
+def test_every_reward_term_and_measure_is_logged_at_every_iteration(base: Path):
+    logs = EventAccumulator(str(base))
+    logs.Reload()
+    tags = set(logs.Tags()["scalars"])
+    groups = {"lower": LowerRewards(), "upper": UpperRewards()}
+    terms = {f"{name}/{f.name}" for name, g in groups.items() for f in fields(g) if getattr(g, f.name) != 0.0}
+    assert len(terms) > 20
+    measures = {
+        "command/error_velocity",
+        "command/slope_x",
+        "episode/falls_per_s",
+        "throughput/steps_per_s",
+        *(f"agents/{name}/{what}" for name in groups for what in ("action_std", "learning_rate", "kl", "value")),
+    }
+    assert terms | measures <= tags
+    for tag in tags:
+        events = logs.Scalars(tag)
+        assert [e.step for e in events] == [48, 96], tag
+        assert all(math.isfinite(e.value) for e in events), tag
+
+
+def test_a_resumed_run_keeps_its_config_but_for_what_is_overridden(checkpoint: Path):
+    folder = checkpoint.parent
+    assert run("base", RESUME, checkpoint, ITERATIONS, 3, LAM, 0.8) == 0
+    content = newest(folder)
+    assert content["iteration"] == 3
+    assert content["samples"] == 3 * 6 * 8
+    training = content["config"]["training"]
+    assert (training["ppo"]["gamma"], training["ppo"]["lam"]) == (0.9, 0.8)
+    assert training["ppo"]["hidden"] == [8, 8]
+    assert training["env"]["num_envs"] == 8
+    assert training["runner"]["iterations"] == 3
+
+
+def test_a_resumed_run_ends_where_a_straight_one_does(checkpoint: Path, tmp_path: Path):
+    assert run("base", RESUME, checkpoint, ITERATIONS, 3) == 0
+    straight = run_small(tmp_path / "straight", GAMMA, 0.9, ITERATIONS, 3)
+    resumed = newest(checkpoint.parent)
+    for key, value in straight["model"].items():
+        assert torch.equal(value, resumed["model"][key]), key
+    assert torch.equal(straight["env"]["sim"]["state"], resumed["env"]["sim"]["state"])
+
+
+def test_a_run_repeats_for_its_seed_and_for_no_other(base: Path, tmp_path: Path):
+    first = newest(base)["model"]
+    again = run_small(tmp_path / "again", GAMMA, 0.9)["model"]
+    other = run_small(tmp_path / "other", GAMMA, 0.9, SEED, 1)["model"]
+    assert all(torch.equal(v, again[k]) for k, v in first.items())
+    assert not torch.equal(first["actors.lower.mlp.0.weight"], other["actors.lower.mlp.0.weight"])
+
+
+def test_sigterm_saves_and_exits_cleanly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    step, calls = H1Env.step, []
+
+    def interrupted(self: H1Env, actions: torch.Tensor) -> Any:
+        calls.append(1)
+        if len(calls) == 8:
+            signal.raise_signal(signal.SIGTERM)
+        return step(self, actions)
+
+    monkeypatch.setattr(H1Env, "step", interrupted)
+    content = run_small(tmp_path / "run", ITERATIONS, 50)
+    assert content["iteration"] == 2
+    assert content["env"] != {}
+
+
+def captured(monkeypatch: pytest.MonkeyPatch, *args: Any) -> train.BaseOptions:
+    """The options that a command line amounts to."""
+    out: list[train.BaseOptions] = []
+    monkeypatch.setattr(train, "train_base", out.append)
+    assert run(*args) == 0
+    return out[0]
+
+
+@pytest.mark.parametrize("recipe", BASE_RECIPES)
+@pytest.mark.parametrize("stage", [["base"], []], ids=["base", "no stage"])
+def test_recipe_sets_the_defaults(monkeypatch: pytest.MonkeyPatch, recipe: str, stage: list[str]):
+    options = captured(monkeypatch, *stage, RECIPE, recipe, f"{ENVS}=16", SEED, 7)
+    expected = BASE_RECIPES[recipe]()
+    expected.env.num_envs, expected.seed = 16, 7
+    assert options.training == expected
+    assert options.recipe == recipe
