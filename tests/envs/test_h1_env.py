@@ -328,10 +328,30 @@ def test_assistance_pulls_towards_the_command_and_fades(make_env):
     assert not env.sim.xfrc[:, 1].any()
 
 
+def test_assistance_lifts_towards_the_commanded_height(make_env):
+    assist = AssistConfig(enabled=True, weight_share=0.25, height_stiffness=1000.0, height_damping=0.0)
+    env = make_env(2, assist=assist, hand_forces=FREE_HANDS, randomization=NOMINAL)
+    stand_or_walk(env, [1.0, 1.0], [0.0, 0.0])
+    env.commands._height = env.state.height + torch.tensor([0.05, -0.05])
+    env.step(torch.zeros(2, 19))
+    lift = env.sim.xfrc[:, env.sim.model.body("pelvis").id, 2] - 0.25 * 51.437 * 9.81
+    assert lift.tolist() == [pytest.approx(50.0, abs=0.1), pytest.approx(-50.0, abs=0.1)]
+
+
 def test_without_assistance_there_is_no_wrench_on_the_base(make_env):
     env = make_env(2)
     rollout(env, 3)
     assert not env.sim.xfrc[:, env.sim.model.body("pelvis").id].any()
+
+
+def test_joint_accelerations_are_the_change_of_velocity(make_env):
+    env = make_env(2)
+    rollout(env, 3)
+    before = env.sim.qvel[:, 6:].clone()
+    env.step(torch.ones(2, 19))
+    change = (env.sim.qvel[:, 6:] - before).float()
+    torch.testing.assert_close(env.record.joint_acceleration, change / 0.02, atol=1e-3, rtol=1e-4)
+    assert float(change.abs().max()) > 0.1
 
 
 def test_falls_and_time_outs_are_told_apart(make_env):

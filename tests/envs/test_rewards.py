@@ -74,25 +74,26 @@ def perfect() -> StepRecord:
 
 
 def changed(**changes) -> StepRecord:
-    """The perfect step with some tensors, of the record, its state or its command, replaced."""
+    """The perfect step with some tensors, of the record, its state, command or reference, replaced."""
     record = perfect()
     for name, value in changes.items():
-        holder = next(h for h in (record, record.state, record.command) if hasattr(h, name))
+        holder = next(h for h in (record, record.state, record.command, record.reference) if hasattr(h, name))
         value = torch.as_tensor(value)
         assert value.shape == getattr(holder, name).shape
         new = dataclasses.replace(holder, **{name: value})
         if holder is record:
             record = new
         else:
-            field = "state" if isinstance(holder, RobotState) else "command"
+            field = next(f for f in ("state", "command", "reference") if getattr(record, f) is holder)
             record = dataclasses.replace(record, **{field: new})
     return record
 
 
 # What each term gives when all is right.
 BEST = {
-    "track_velocity": 1.0, "track_velocity_closely": 1.0, "track_yaw_rate": 1.0, "track_yaw_rate_closely": 1.0, "track_height": 1.0,
-    "contact_schedule": 1.0, "alive": 1.0, "track_arms": 1.0, "track_key_points": 1.0, "track_key_velocities": 1.0,
+    "track_velocity": 1.0, "track_velocity_closely": 1.0, "track_yaw_rate": 1.0, "track_yaw_rate_closely": 1.0,
+    "track_height": 1.0, "contact_schedule": 1.0, "alive": 1.0, "track_arms": 1.0,
+    "track_key_points": 1.0, "track_key_velocities": 1.0,
 }  # fmt: skip
 ALL_TERMS = sorted({f.name for group in (LowerRewards, UpperRewards) for f in dataclasses.fields(group)})
 
@@ -149,6 +150,7 @@ CASES = [
     ("alive", {"fell": [True]}, 0.0),
     ("fall", {"fell": [True]}, 1.0),
     ("track_arms", {"joint_pos": [[9.0, 9.0, 9.0, 0.1, -0.2]]}, math.exp(-0.05 / 0.06)),
+    ("track_arms", {"joint_pos": [[0, 0, 0, 0.3, -0.1]], "position": [[0.2, 0.1]]}, math.exp(-0.05 / 0.06)),
     ("track_key_points", {"key_points_t": [[[0.2, 0.2, 0.2], [0.2, -0.1, 0.1]]]}, math.exp(-0.02 / 0.01)),
     ("track_key_velocities", {"key_velocities_t": [[[0.5, 0, 0], [0, -1.0, 0]]]}, math.exp(-1.25)),
     ("arm_residual", {"action": [[9.0, 9.0, 9.0, 1.0, -2.0]]}, 5.0),

@@ -135,7 +135,7 @@ class CommandSource(Stateful):
 def desired_contact(
     phase: torch.Tensor, stand: torch.Tensor, num_feet: int, stance_share: float = 0.58
 ) -> torch.Tensor:
-    """Which feet should be on the ground, (N, num_feet) bool: foot i lags the phase by i / num_feet."""
+    """Which feet should be on the ground, (N, num_feet) bool: foot i is i / num_feet ahead."""
     shift = torch.arange(num_feet, dtype=phase.dtype) / num_feet
     return ((phase.unsqueeze(1) + shift).remainder(1.0) < stance_share) | (stand.unsqueeze(1) > 0.5)
 
