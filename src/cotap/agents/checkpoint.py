@@ -6,7 +6,6 @@ import contextlib
 import hashlib
 import json
 import os
-import pickle
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -30,6 +29,8 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     """
     handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent)
     os.close(handle)
+    os.umask(mask := os.umask(0))  # the only way to read it
+    os.chmod(name, 0o666 & ~mask)  # a temporary file is private; the file that it becomes is like any other
     temporary = Path(name)
     try:
         write(temporary)
@@ -76,7 +77,7 @@ def load_checkpoint(path: Path | str, device: str = "cpu") -> dict[str, Any]:
         raise CheckpointError(f"checkpoint {str(path)!r} does not exist")
     try:
         content = torch.load(path, map_location=device, weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError, KeyError) as error:
+    except Exception as error:  # on rubbish, torch's restricted unpickler raises whatever its reading stumbles over
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise CheckpointError(f"checkpoint {str(path)!r} cannot be read (truncated or foreign): {reason}") from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:
