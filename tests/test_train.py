@@ -190,9 +190,7 @@ def test_a_checkpoint_that_cannot_be_resumed_is_named_and_leaves_nothing(
     assert tree(tmp_path) == before
 
 
-def test_another_observation_layout_is_refused(
-    checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_another_observation_layout_is_refused(checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     before = tree(tmp_path)
     assert run("base", RESUME, checkpoint, RUN_DIR, tmp_path / "run", ITERATIONS, 3, HISTORY, 4) == 2
     assert "another history: 5, here 4" in capsys.readouterr().err
@@ -226,9 +224,7 @@ def test_resuming_into_the_directory_of_a_third_run_is_refused(
 
 
 @pytest.mark.parametrize("below", ["", "run"])
-def test_a_run_directory_that_cannot_be_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], below: str
-):
+def test_a_run_directory_that_cannot_be_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str], below: str):
     file = tmp_path / "file"
     file.write_text("mine")
     assert run("base", *SMALL, RUN_DIR, file / below) == 2

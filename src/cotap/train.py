@@ -54,14 +54,18 @@ def main(argv: list[str] | None = None) -> int:
 
 def _parse(args: list[str]) -> BaseOptions:
     """Options on top of the resumed checkpoint's config, or else of the recipe's."""
-    from cotap.agents.checkpoint import load_checkpoint
+    from cotap.agents.checkpoint import CheckpointError, load_checkpoint
 
     args = [SHORTCUTS.get(key, key) + sep + value for key, sep, value in (a.partition("=") for a in args)]
     first: Any = _peek(args, "--resume")
     recipe = require_one_of("recipe", _peek(args, "--recipe") or "default", BASE_RECIPES.keys())
     training = BASE_RECIPES[recipe]()
     if first:
-        training = from_plain(BaseTraining, load_checkpoint(first)["config"]["training"])
+        content = load_checkpoint(first)
+        try:
+            training = from_plain(BaseTraining, content["config"]["training"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise CheckpointError(f"checkpoint {first!r} has no usable config: {error}") from error
     default = BaseOptions(recipe=recipe, training=training)
     return tyro.cli(BaseOptions, args=args, default=default, prog="python -m cotap.train base")
 
@@ -83,12 +87,10 @@ def train_base(options: BaseOptions) -> Path:
     from cotap.envs import H1Env
 
     training = options.training
-    run_dir = Path(options.run_dir or (Path(options.resume).parent if options.resume else _new_run_dir("base")))
+    resumed_dir = Path(options.resume).parent if options.resume else None
+    run_dir = Path(options.run_dir) if options.run_dir else resumed_dir or _new_run_dir("base")
     training.env.seed, training.env.num_threads = training.seed, training.threads
-    training.env.check()
-    training.ppo.check()
-    training.runner.check()
-    check_run_dir(run_dir, resuming=bool(options.resume))
+    training.check()
     if training.threads:
         torch.set_num_threads(training.threads)
     torch.manual_seed(training.seed)
@@ -96,6 +98,8 @@ def train_base(options: BaseOptions) -> Path:
     runner = DualRunner(H1Env(training.env), training.runner, training.ppo, run_dir, config, training.device)
     if options.resume:
         runner.load(options.resume)
+    # Last, so that nothing is left behind when any of the above refuses.
+    check_run_dir(run_dir, resuming=resumed_dir is not None and run_dir.resolve() == resumed_dir.resolve())
     runner.learn(init_at_random_ep_len=True)
     print(f"{runner.current_learning_iteration} iterations, {runner.wall_seconds:.0f} s: {run_dir}")
     return run_dir

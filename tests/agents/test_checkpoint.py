@@ -72,7 +72,7 @@ def test_files_are_readable_by_whom_the_umask_allows(tmp_path: Path, mask: int):
 @pytest.mark.parametrize("name", ["missing.pt", "missing/checkpoint.pt", "."])
 def test_missing_file_is_named(tmp_path: Path, name: str):
     path = tmp_path / name
-    with pytest.raises(CheckpointError, match="does not exist|is a directory") as error:
+    with pytest.raises(CheckpointError, match=r"does not exist|is a directory") as error:
         load_checkpoint(path)
     assert str(path) in str(error.value)
 
@@ -120,7 +120,7 @@ FOREIGN: dict[str, Callable[[Path], object]] = {
 def test_foreign_file_is_refused(tmp_path: Path, kind: str):
     path = tmp_path / "foreign.pt"
     FOREIGN[kind](path)
-    with pytest.raises(CheckpointError, match="cannot be read|is not a cotap checkpoint") as error:
+    with pytest.raises(CheckpointError, match=r"cannot be read|is not a cotap checkpoint") as error:
         load_checkpoint(path)
     assert str(path) in str(error.value)
     assert "\n" not in str(error.value)
@@ -197,7 +197,7 @@ def test_full_disk_leaves_the_old_file_and_nothing_else(
         raise error
 
     monkeypatch.setattr(torch, "save", fail_part_way)
-    with pytest.raises(OSError, match="unexpected pos|No space left"):
+    with pytest.raises(OSError, match=r"unexpected pos|No space left"):
         save_checkpoint(path, {"weights": torch.zeros(3)})
     assert names(tmp_path) == ([path.name] if existed else [])
     if existed:
@@ -244,7 +244,7 @@ def test_a_file_that_cannot_be_written_whole_is_not_written_at_all(good: Path):
 
 def test_a_folder_that_is_none_is_an_os_error(good: Path):
     for path in (good / "checkpoint.pt", good.parent / "missing" / "checkpoint.pt"):
-        with pytest.raises(OSError, match="Not a directory|No such file"):
+        with pytest.raises(OSError, match=r"Not a directory|No such file"):
             save_checkpoint(path, CONTENT)
 
 

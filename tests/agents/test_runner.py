@@ -269,6 +269,25 @@ def test_logged_rewards_are_means_over_the_iteration(tmp_path: Path):
     assert logs.Scalars("upper/target")[0].value == pytest.approx(sum(seen) / STEPS, rel=1e-5)
 
 
+def test_learner_is_told_what_the_environment_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    runner = make_runner(tmp_path, 3)
+    said: list[tuple[torch.Tensor, ...]] = []
+    heard: list[tuple[torch.Tensor, ...]] = []
+    step, process = runner.env.step, runner.alg.process_step
+
+    def spy(actions: torch.Tensor) -> Any:
+        result = step(actions)
+        said.append((result[3]["group_rewards"], result[2], result[3]["time_outs"]))
+        return result
+
+    monkeypatch.setattr(runner.env, "step", spy)
+    monkeypatch.setattr(runner.alg, "process_step", lambda *args: (heard.append(args), process(*args)))
+    runner.learn()
+    assert_same([list(s) for s in said], [list(h) for h in heard])
+    ends = torch.stack([torch.stack(s[1:]) for s in said]).sum((0, 2))
+    assert 0 < int(ends[1]) < int(ends[0]), "there were no falls or no time-outs"
+
+
 @pytest.mark.parametrize("content", [b"", b"rubbish" * 50_000])
 def test_an_unreadable_older_checkpoint_does_not_end_a_run(tmp_path: Path, content: bytes):
     tmp_path.joinpath("checkpoint_000000.pt").write_bytes(content)

@@ -18,8 +18,8 @@ from cotap.agents.losses import (
     gaussian_log_prob,
     generalized_advantages,
 )
-from cotap.agents.precision import resolve_precision
-from cotap.checks import require_positive_int, require_range
+from cotap.agents.precision import PRECISIONS, resolve_precision
+from cotap.checks import require_one_of, require_positive_int, require_range
 
 
 @dataclass
@@ -61,6 +61,7 @@ class DualPPOConfig:
         """Raise ValueError naming the first field that is out of its range."""
         for name in ("steps", "epochs", "mini_batches", "normalizer_stride"):
             require_positive_int(f"ppo.{name}", getattr(self, name))
+        require_one_of("ppo.precision", self.precision, PRECISIONS)
         if not self.hidden:
             raise ValueError("ppo.hidden must name at least one layer, got ()")
         for i, width in enumerate(self.hidden):
@@ -117,10 +118,11 @@ class DualPPO:
             )
             for name in self.names
         }
-        if num_envs * cfg.steps < cfg.mini_batches:
-            raise ValueError(
-                f"ppo.mini_batches must be at most num_envs * steps = {num_envs * cfg.steps}, got {cfg.mini_batches}"
-            )
+        total = num_envs * cfg.steps
+        if total < cfg.mini_batches:
+            raise ValueError(f"ppo.mini_batches must be at most num_envs * steps = {total}, got {cfg.mini_batches}")
+        if total < 2:  # advantages are scaled by their spread, which one sample does not have
+            raise ValueError(f"num_envs * steps must be at least 2, got {total}")
         t, n, g, a = cfg.steps, num_envs, len(self.names), layout.num_actions
 
         def buffer(width: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:

@@ -94,12 +94,13 @@ class DualRunner(OnPolicyRunner):
     def learn(self, num_learning_iterations: int | None = None, init_at_random_ep_len: bool = False) -> None:
         """Train up to `runner.iterations` in all (or for so many more), saving at intervals and at the end."""
         env, alg = self.env, self.alg
+        self._stop = False
         first = self.current_learning_iteration
         last = self.runner_cfg.iterations if num_learning_iterations is None else first + num_learning_iterations
         if init_at_random_ep_len and first == 0:
             env.episode_length_buf = torch.randint_like(env.episode_length_buf, high=int(env.max_episode_length))
         write_json(self.run_dir / "config.json", self.config)
-        writer = SummaryWriter(str(self.run_dir), purge_step=first)
+        writer = SummaryWriter(str(self.run_dir), purge_step=first * alg.cfg.steps * env.num_envs + 1)
         precision = str(alg.dtype).removeprefix("torch.")
         tqdm.write(f"{env.num_envs} worlds, networks {alg.cfg.hidden} in {precision} on {self.device}, {self.run_dir}")
         obs = self._observations()
@@ -141,8 +142,8 @@ class DualRunner(OnPolicyRunner):
                 if self._stop:
                     tqdm.write("stopping: saving a checkpoint")
                     break
-        if saved != self.current_learning_iteration:
-            self.save()
+            if saved != self.current_learning_iteration:
+                self.save()
         writer.close()
 
     def save(self, path: str | None = None, infos: dict | None = None) -> None:
@@ -150,10 +151,8 @@ class DualRunner(OnPolicyRunner):
         target = Path(path) if path else self.run_dir / f"checkpoint_{self.current_learning_iteration:06d}.pt"
         save_checkpoint(target, self._content() | {"infos": infos or {}})
         for older in sorted(self.run_dir.glob(CHECKPOINT_PATTERN)):
-            if older < target and older.stat().st_size > 0.5 * target.stat().st_size:
-                content = load_checkpoint(older)
-                if content["env"]:
-                    save_checkpoint(older, content | {"env": {}})
+            if older < target:
+                _shed_simulator_states(older)
 
     def load(self, path: str, *_: Any, map_location: str | None = None, **__: Any) -> dict:
         """Load a checkpoint. What it lacks (a shipped one has no optimiser or simulator states) starts afresh.
@@ -162,6 +161,9 @@ class DualRunner(OnPolicyRunner):
             CheckpointError: the file cannot be used, or was trained for another robot or observation layout.
         """
         content = load_checkpoint(path, map_location or self.device)
+        for part in ("layout", "config", "model", "learner", "env", "iteration", "samples", "wall_seconds", "rng"):
+            if part not in content:
+                raise CheckpointError(f"checkpoint {path!r} lacks its part {part!r}")
         env: Any = self.env
         require_layout(path, content["layout"], json.loads(json.dumps(env.layout())))
         try:
@@ -183,7 +185,7 @@ class DualRunner(OnPolicyRunner):
             fresh.append("simulator states")
         if fresh:
             tqdm.write(f"{path}: no {' and '.join(fresh)} for this run; starting those afresh")
-        return content["infos"]
+        return content.get("infos", {})
 
     def _content(self) -> dict[str, Any]:
         env: Any = self.env
@@ -224,6 +226,16 @@ class DualRunner(OnPolicyRunner):
         finally:
             for number, handler in handlers.items():
                 signal.signal(number, handler)
+
+
+def _shed_simulator_states(path: Path) -> None:
+    """Only a run's newest checkpoint keeps them; a file that is no checkpoint is left as it is."""
+    try:
+        content = load_checkpoint(path)
+    except CheckpointError:
+        return
+    if content.get("env"):
+        save_checkpoint(path, content | {"env": {}})
 
 
 def _summary(s: dict[str, float]) -> str:

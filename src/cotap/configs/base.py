@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+import torch
+
 from cotap.agents.dual_ppo import DualPPOConfig
 from cotap.agents.runner import RunnerConfig
+from cotap.checks import require_range
 from cotap.envs import H1EnvConfig
 
 
@@ -23,6 +26,17 @@ class BaseTraining:
     env: H1EnvConfig = field(default_factory=H1EnvConfig)
     ppo: DualPPOConfig = field(default_factory=DualPPOConfig)
     runner: RunnerConfig = field(default_factory=RunnerConfig)
+
+    def check(self) -> None:
+        """Raise ValueError naming the first field that is out of its range."""
+        require_range("threads", self.threads, 0, 4096)
+        try:
+            torch.empty(0, device=self.device)
+        except (RuntimeError, AssertionError) as error:
+            raise ValueError(f"device {self.device!r} cannot be used here: {str(error).splitlines()[0]}") from error
+        self.env.check()
+        self.ppo.check()
+        self.runner.check()
 
 
 def default() -> BaseTraining:

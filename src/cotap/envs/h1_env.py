@@ -24,7 +24,7 @@ from cotap.envs.observations import (
 )
 from cotap.envs.persistence import uniform
 from cotap.envs.randomization import RandomizationConfig, Randomizer
-from cotap.envs.rewards import LowerRewards, RewardGroup, StepRecord, UpperRewards
+from cotap.envs.rewards import LowerRewards, RewardGroup, StepRecord, UpperRewards, check_weights
 from cotap.envs.state import RobotState, StateReader
 from cotap.envs.terminations import TerminationConfig, diverged, fallen
 from cotap.robots import ROBOTS
@@ -109,6 +109,8 @@ class H1EnvConfig:
                      self.assist):  # fmt: skip
             part.check()
         self.randomization.check(self.control_dt)
+        check_weights("lower", self.rewards.lower)
+        check_weights("upper", self.rewards.upper)
 
 
 class H1Env(VecEnv):

@@ -273,6 +273,12 @@ def upper_joint_limits(s: StepRecord) -> torch.Tensor:
     return _limit_excess(s, slice(s.num_lower, None))
 
 
+def check_weights(name: str, weights: LowerRewards | UpperRewards) -> None:
+    """Raise ValueError naming the first weight of the group `name` that is not finite."""
+    for f in fields(weights):
+        require_finite(f"rewards.{name}.{f.name}", getattr(weights, f.name))
+
+
 ONCE = ("fall",)
 """Terms that are not rates."""
 
@@ -281,10 +287,11 @@ class RewardGroup:
     """The weighted sum of one agent's terms, and each term's own mean for the log."""
 
     def __init__(self, name: str, weights: LowerRewards | UpperRewards, dt: float) -> None:
+        check_weights(name, weights)
         self.name = name
         self.terms: dict[str, tuple[Callable[[StepRecord], torch.Tensor], float]] = {}
         for f in fields(weights):
-            weight = require_finite(f"rewards.{name}.{f.name}", getattr(weights, f.name))
+            weight = getattr(weights, f.name)
             if weight != 0.0:
                 self.terms[f.name] = (globals()[f.name], weight * (1.0 if f.name in ONCE else dt))
 
