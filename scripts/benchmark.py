@@ -1,14 +1,17 @@
 """How fast: physics, environment and training on this machine, as ratios within one run, beside its peers.
 
 The physics reference is fixed: control steps of four 5 ms `mj_step` of H1 with feet-only contacts in plain mjbatch,
-from the states and with the torques of a recorded rollout of the shipped base policy, and nothing else. All figures
-are control steps (20 ms) per second.
+from the states and with the torques of a recorded rollout of the shipped base policy, and nothing else. Open-loop
+torques soon make a robot fall, so each control step starts from its recorded state (restarts included); only the
+stepping is timed. All figures are control steps (20 ms) per second. Parts are measured in turn, several times over:
+rates are medians over the rounds, ratios are medians of the ratios within rounds.
 """
 
 from __future__ import annotations
 
+# MuJoCo's extension module has no type stubs.
+# pyright: reportAttributeAccessIssue=false
 import argparse
-import json
 import os
 import platform
 import resource
@@ -19,6 +22,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -33,14 +37,20 @@ from cotap.agents.actors import as_dict
 from cotap.agents.checkpoint import write_json
 from cotap.agents.dual_ppo import DualPPO
 from cotap.agents.runner import layout_of
+from cotap.checks import require_positive_int, require_range
 from cotap.configs import BASE_RECIPES, BaseTraining
 from cotap.envs import H1Env, H1EnvConfig
-from cotap.evaluation.policy import Policy, load_policy, shipped_checkpoint
+from cotap.evaluation.policy import load_policy, shipped_checkpoint
 from cotap.robots import h1
 from cotap.robots.mjcf import build_model
 
 PEER_ENVS = 32
 SUBSTEPS, TIMESTEP_S = 4, 0.005
+WARM_UP_STEPS = 50
+PEERS = ("mujoco_rollout", "gymnasium_async", "gymnasium_sync")
+VERSIONED = ("torch", "mujoco", "mjbatch", "rsl-rl-lib", "gymnasium", "numpy")
+
+Actor = Callable[[dict[str, torch.Tensor]], torch.Tensor]
 
 
 @dataclass(frozen=True)
@@ -60,13 +70,20 @@ def reference_model() -> mujoco.MjModel:
 
 
 def full_env(num_envs: int) -> H1Env:
-    """Everything on, as in training after the gantry is gone."""
+    """Everything on, as in training after the gantry is gone; worlds time out at different times."""
     cfg = H1EnvConfig(num_envs=num_envs)
     cfg.hand_forces.curriculum_start = 1.0
-    return H1Env(cfg)
+    env = H1Env(cfg)
+    env.episode_length_buf = torch.randint_like(env.episode_length_buf, high=env.max_episode_length)
+    return env
 
 
-def record(env: H1Env, policy: Policy, warm_up: int, steps: int) -> Recording:
+def scripted(observations: dict[str, torch.Tensor]) -> torch.Tensor:
+    """No action: default legs stepping to the gait clock. Stands in where there is no checkpoint."""
+    return torch.zeros(observations["policy"].shape[0], len(h1().joints))
+
+
+def record(env: H1Env, policy: Actor, warm_up: int, steps: int) -> Recording:
     """Let the policy walk, then record."""
     rows: dict[str, list[np.ndarray]] = {"qpos": [], "qvel": [], "torque": []}
     obs = env.get_observations()
@@ -83,35 +100,38 @@ def record(env: H1Env, policy: Policy, warm_up: int, steps: int) -> Recording:
 class PhysicsReference:
     """Plain mjbatch on a recording; only the stepping is timed."""
 
-    def __init__(self, recording: Recording) -> None:
-        self.recording = recording
+    def __init__(self, recording: Recording, seconds: float) -> None:
+        self.recording, self.seconds = recording, seconds
         self.batch = Batch(reference_model(), recording.qpos.shape[1])
         self.qpos, self.qvel, self.ctrl = (self.batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
 
     def run(self) -> float:
-        r, spent = self.recording, 0.0
-        for qpos, qvel, torque in zip(r.qpos, r.qvel, r.torque, strict=True):
-            self.qpos[:], self.qvel[:], self.ctrl[:] = qpos, qvel, torque
-            start = time.perf_counter()
-            self.batch.step(nstep=SUBSTEPS)
-            spent += time.perf_counter() - start
-        return r.qpos.shape[0] * r.qpos.shape[1] / spent
+        r, spent, steps = self.recording, 0.0, 0
+        while spent < self.seconds:
+            for qpos, qvel, torque in zip(r.qpos, r.qvel, r.torque, strict=True):
+                self.qpos[:], self.qvel[:], self.ctrl[:] = qpos, qvel, torque
+                start = time.perf_counter()
+                self.batch.step(nstep=SUBSTEPS)
+                spent += time.perf_counter() - start
+                steps += 1
+        return steps * r.qpos.shape[1] / spent
 
 
 class EnvStepping:
     """`H1Env.step` with everything on; the policy's own time is not counted."""
 
-    def __init__(self, env: H1Env, policy: Policy, steps: int) -> None:
-        self.env, self.policy, self.steps = env, policy, steps
+    def __init__(self, env: H1Env, policy: Actor, seconds: float) -> None:
+        self.env, self.policy, self.seconds = env, policy, seconds
 
     def run(self) -> float:
-        obs, spent = self.env.get_observations(), 0.0
-        for _ in range(self.steps):
+        obs, spent, steps = self.env.get_observations(), 0.0, 0
+        while spent < self.seconds:
             actions = self.policy(as_dict(obs))
             start = time.perf_counter()
             obs, *_ = self.env.step(actions)
             spent += time.perf_counter() - start
-        return self.steps * self.env.num_envs / spent
+            steps += 1
+        return steps * self.env.num_envs / spent
 
 
 class Training:
@@ -175,7 +195,7 @@ def gymnasium_rate(vector: gymnasium.vector.VectorEnv, seconds: float) -> float:
     return rate
 
 
-def rollout_rate(recording: Recording) -> float:
+def rollout_rate(recording: Recording, seconds: float) -> float:
     """Control steps per second of `mujoco.rollout` on the recording, from its states with its torques."""
     model = reference_model()
     threads = os.cpu_count() or 1
@@ -183,16 +203,18 @@ def rollout_rate(recording: Recording) -> float:
     k, n = recording.qpos.shape[:2]
     pool = rollout.Rollout(nthread=threads)
     state = np.zeros((n, mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
-    spent = 0.0
-    for i in range(k):
+    spent, steps = 0.0, 0
+    while spent < seconds:
+        i = steps % k
         state[:, 1 : 1 + model.nq] = recording.qpos[i]
         state[:, 1 + model.nq : 1 + model.nq + model.nv] = recording.qvel[i]
         control = np.repeat(recording.torque[i][:, None], SUBSTEPS, 1)
         start = time.perf_counter()
         pool.rollout(model, data, state, control)
         spent += time.perf_counter() - start
+        steps += 1
     pool.close()
-    return k * n / spent
+    return steps * n / spent
 
 
 def rounds(parts: dict[str, Callable[[], float]], repeats: int) -> dict[str, list[float]]:
@@ -206,8 +228,10 @@ def rounds(parts: dict[str, Callable[[], float]], repeats: int) -> dict[str, lis
     return results
 
 
-def ratio(results: dict[str, list[float]], part: str, to: str = "physics") -> float:
-    """Median of the ratios within rounds."""
+def ratio(results: dict[str, list[float]], part: str, to: str = "physics") -> float | None:
+    """Median of the ratios within rounds; None for a part that was not measured."""
+    if part not in results:
+        return None
     return statistics.median(a / b for a, b in zip(results[part], results[to], strict=True))
 
 
@@ -216,7 +240,8 @@ def peak_memory_mib(num_envs: int) -> float:
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "cotap.train", "base", "--num-envs", str(num_envs), "--iterations", "2"]
         subprocess.run([*command, "--run-dir", f"{folder}/run"], check=True, capture_output=True)
-    return resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024.0
+    unit = 2**20 if sys.platform == "darwin" else 2**10  # bytes there, KiB elsewhere
+    return resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / unit
 
 
 def machine() -> dict[str, Any]:
@@ -232,67 +257,125 @@ def machine() -> dict[str, Any]:
         "cores": os.cpu_count(),
         "torch_threads": torch.get_num_threads(),
         "python": platform.python_version(),
-        "torch": torch.__version__,
-        "mujoco": mujoco.__version__,
+        "versions": {name: version(name) for name in VERSIONED},
     }
 
 
-def measure(num_envs: int, repeats: int, steps: int, sizes: list[int], checkpoint: Path) -> dict[str, Any]:
+def rates_by_size(sizes: list[int], policy: Actor, seconds: float, repeats: int) -> dict[str, float]:
+    """Environment steps per second at each number of worlds: medians over rounds."""
+    rates: dict[str, list[float]] = {str(n): [] for n in sizes}
+    for _ in range(repeats):
+        for n in sizes:
+            stepping = EnvStepping(full_env(n), policy, seconds)
+            stepping.run()  # warm up
+            rates[str(n)].append(stepping.run())
+    return {n: statistics.median(values) for n, values in rates.items()}
+
+
+def sizes(text: str) -> list[int]:
+    """Comma-separated positive integers."""
+    values = [int(part) for part in text.split(",") if part]
+    if any(n <= 0 for n in values):
+        raise argparse.ArgumentTypeError(f"sizes must be positive, got {text!r}")
+    return values
+
+
+def measure(options: argparse.Namespace) -> dict[str, Any]:
     """Everything that goes into the JSON."""
     torch.manual_seed(0)
-    memory = peak_memory_mib(num_envs)  # first, while this process is small
-    policy = load_policy(checkpoint)
+    num_envs, seconds, repeats = options.num_envs, options.seconds, options.repeats
+    checkpoint: Path = options.checkpoint or shipped_checkpoint("base")
+    is_trained = bool(options.checkpoint) or checkpoint.exists()
+    policy: Actor = load_policy(checkpoint) if is_trained else scripted
+    memory = peak_memory_mib(num_envs)  # before this process grows, whose size a child's peak begins with
     env = full_env(num_envs)
-    recording = record(env, policy, warm_up=50, steps=steps)
+    recording = record(env, policy, WARM_UP_STEPS, options.steps)
     parts: dict[str, Callable[[], float]] = {
-        "physics": PhysicsReference(recording).run,
-        "env": EnvStepping(env, policy, steps).run,
-        "train": Training(env, BASE_RECIPES["default"]()).run,
-        "train_paper": Training(env, BASE_RECIPES["paper"]()).run,
-        "mujoco_rollout": lambda: rollout_rate(recording),
+        "physics": PhysicsReference(recording, seconds).run,
+        "env": EnvStepping(env, policy, seconds).run,
     }
+    train_env = full_env(num_envs)  # of its own: an untrained policy falls, and would leave the other on the ground
+    networks = {"default": "train", "paper": "train_paper"}
+    for name in options.networks:
+        parts[networks[name]] = Training(train_env, BASE_RECIPES[name]()).run
+    parts["mujoco_rollout"] = lambda: rollout_rate(recording, seconds)
+    makers = [PlainEnv] * PEER_ENVS
+    parts["gymnasium_async"] = lambda: gymnasium_rate(gymnasium.vector.AsyncVectorEnv(makers), seconds)
+    parts["gymnasium_sync"] = lambda: gymnasium_rate(gymnasium.vector.SyncVectorEnv(makers), seconds)
     results = rounds(parts, repeats)
     median = {name: statistics.median(rates) for name, rates in results.items()}
-    makers = [PlainEnv] * PEER_ENVS
-    by_size = {str(n): EnvStepping(full_env(n), policy, max(10, steps * num_envs // n // 2)).run() for n in sizes}
+    del parts, env, train_env
+    by_size = rates_by_size(options.sizes, policy, seconds, repeats)
     return {
         "num_envs": num_envs,
+        "policy": checkpoint.name if is_trained else "scripted: no checkpoint is shipped",
         "physics_steps_per_s": median["physics"],
         "env_steps_per_s": median["env"],
-        "train_steps_per_s": median["train"],
-        "train_paper_steps_per_s": median["train_paper"],
+        "train_steps_per_s": median.get("train"),
+        "train_paper_steps_per_s": median.get("train_paper"),
         "env_over_physics": ratio(results, "env"),
         "train_over_physics": ratio(results, "train"),
         "train_paper_over_physics": ratio(results, "train_paper"),
+        "train_note": None if len(options.networks) == 2 else f"networks measured: {', '.join(options.networks)}",
         "env_steps_per_s_by_num_envs": by_size,
+        "env_steps_per_s_spread": 1.0 - min(by_size.values()) / max(by_size.values()) if by_size else None,
         "compliance_ms": None,
         "compliance_over_physics": None,
         "compliance_note": "not measured: this release has no compliance law",
         "peak_rss_mib": memory,
-        "peers": {
-            "mujoco_rollout": median["mujoco_rollout"],
-            "gymnasium_async": gymnasium_rate(gymnasium.vector.AsyncVectorEnv(makers), 3.0),
-            "gymnasium_sync": gymnasium_rate(gymnasium.vector.SyncVectorEnv(makers), 3.0),
-        },
+        "peers": {name: median[name] for name in PEERS},
         "rounds": results,
         "machine": machine(),
     }
+
+
+def table(result: dict[str, Any]) -> str:
+    """The result as a Markdown table."""
+    reference = result["physics_steps_per_s"]
+    rows: list[tuple[str, float | None, float | None]] = [
+        ("physics reference", reference, 1.0),
+        (f"environment, {result['num_envs']} worlds", result["env_steps_per_s"], result["env_over_physics"]),
+        ("training, default networks", result["train_steps_per_s"], result["train_over_physics"]),
+        ("training, paper's networks", result["train_paper_steps_per_s"], result["train_paper_over_physics"]),
+        *((name, rate, rate / reference) for name, rate in result["peers"].items()),
+        *((f"environment, {n} worlds", r, r / reference) for n, r in result["env_steps_per_s_by_num_envs"].items()),
+    ]
+    lines = ["| what | control steps/s | over physics |", "|---|---|---|"]
+    lines += [f"| {name} | {rate:,.0f} | {over:.2f} |" for name, rate, over in rows if rate and over]
+    return "\n".join([*lines, f"\npeak memory of training: {result['peak_rss_mib']:,.0f} MiB"])
 
 
 def main() -> int:
     """Parse, measure, report."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--num-envs", type=int, default=4096)
-    parser.add_argument("--repeats", type=int, default=3, help="rounds; medians are reported")
-    parser.add_argument("--steps", type=int, default=20, help="control steps per measurement")
-    parser.add_argument("--sizes", type=int, nargs="*", default=[512, 1024, 2048, 4096, 8192])
-    parser.add_argument("--checkpoint", type=Path, default=shipped_checkpoint("base"))
+    parser.add_argument(
+        "--seconds", type=float, default=3.0, help="least time per measurement; training takes one iteration"
+    )
+    parser.add_argument("--repeats", type=int, default=3, help="rounds, after one of warming up")
+    parser.add_argument("--steps", type=int, default=20, help="control steps recorded for the physics reference")
+    parser.add_argument("--sizes", type=sizes, default=[512, 1024, 2048, 4096, 8192], help="comma-separated")
+    parser.add_argument("--networks", nargs="+", choices=("default", "paper"), default=["default", "paper"])
+    parser.add_argument("--checkpoint", type=Path, help="policy to record and drive with; by default the shipped base")
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--quick", action="store_true", help="small and short: shows that it runs, measures little")
     options = parser.parse_args()
-    result = measure(options.num_envs, options.repeats, options.steps, options.sizes, options.checkpoint)
-    if options.json:
-        write_json(options.json, result)
-    print(json.dumps({k: v for k, v in result.items() if k != "rounds"}, indent=2))
+    if options.quick:
+        options.num_envs, options.seconds, options.repeats, options.steps = 256, 0.3, 1, 5
+        options.sizes = [128, 256]
+    try:
+        for name in ("num_envs", "repeats", "steps"):
+            require_positive_int(name, getattr(options, name))
+        require_range("seconds", options.seconds, 1e-3, 1e6)
+        if options.json:
+            options.json.parent.mkdir(parents=True, exist_ok=True)
+        result = measure(options)
+        if options.json:
+            write_json(options.json, result)
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print(table(result))
     return 0
 
 

@@ -7,6 +7,7 @@ add the damping inside its implicit integrator, as the environment does.
 from __future__ import annotations
 
 import argparse
+import statistics
 import sys
 import time
 
@@ -17,6 +18,8 @@ from cotap.robots import h1
 from cotap.robots.mjcf import build_model
 
 CONTROL_DT = 0.02
+VARIANTS = ((0.005, False), (0.005, True), (0.01, False), (0.01, True))
+"""Physics step [s], and whether damping is implicit."""
 KP, KD, DEFAULT = (np.array([getattr(j, name) for j in h1().joints]) for name in ("kp", "kd", "default_rad"))
 
 
@@ -50,6 +53,7 @@ def main() -> int:
     parser.add_argument(
         "--spread", type=float, default=0.15, help="standard deviation of targets about the default [rad]"
     )
+    parser.add_argument("--repeats", type=int, default=7, help="rounds of timing")
     options = parser.parse_args()
     rng = np.random.default_rng(0)
     steps = round(options.seconds / CONTROL_DT)
@@ -57,15 +61,21 @@ def main() -> int:
     draws = rng.normal(size=(-(-steps // 5), options.worlds, len(DEFAULT))) * options.spread
     targets = DEFAULT + np.repeat(draws, 5, axis=0)[:steps]
     reference, _ = simulate(0.0005, True, targets)
+    rms: dict[tuple[float, bool], np.ndarray] = {}
+    spent: dict[tuple[float, bool], list[float]] = {variant: [] for variant in VARIANTS}
+    for _ in range(options.repeats):  # in turn, so that all meet the same machine
+        for variant in VARIANTS:
+            angles, seconds = simulate(*variant, targets)
+            rms[variant] = np.sqrt(np.mean((angles - reference) ** 2, axis=(0, 1)))
+            spent[variant].append(seconds)
     print("| step | torque | rms error, mean over joints [rad] | worst joint [rad] | control steps/s, relative |")
     print("|---|---|---|---|---|")
-    base = None
-    for timestep_s, implicit in ((0.005, False), (0.005, True), (0.01, False), (0.01, True)):
-        angles, spent = simulate(timestep_s, implicit, targets)
-        rms = np.sqrt(np.mean((angles - reference) ** 2, axis=(0, 1)))
-        base = base or spent
+    for timestep_s, implicit in VARIANTS:
+        variant = (timestep_s, implicit)
+        speed = statistics.median(a / b for a, b in zip(spent[VARIANTS[0]], spent[variant], strict=True))
         kind = "implicit" if implicit else "explicit"
-        print(f"| {1e3 * timestep_s:g} ms | {kind} | {rms.mean():.4f} | {rms.max():.4f} | {base / spent:.2f} |")
+        error = rms[variant]
+        print(f"| {1e3 * timestep_s:g} ms | {kind} | {error.mean():.4f} | {error.max():.4f} | {speed:.2f} |")
     return 0
 
 

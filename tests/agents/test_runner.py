@@ -251,6 +251,19 @@ def test_logs_of_a_resumed_run_are_one_curve(tmp_path: Path):
         assert [e.step for e in logs.Scalars(tag)] == [STEPS * WORLDS * i for i in (1, 2, 3, 4, 5)], tag
 
 
+@pytest.mark.parametrize("worlds", [4, 16])
+def test_logs_count_samples_also_when_the_number_of_worlds_changes(tmp_path: Path, worlds: int):
+    make_runner(tmp_path, 3).learn()
+    runner = make_runner(tmp_path, 5, env=DummyEnv(worlds))
+    runner.load(str(checkpoint(tmp_path, 3)))
+    runner.learn()
+    logs = EventAccumulator(str(tmp_path))
+    logs.Reload()
+    before = 3 * WORLDS
+    expected = [STEPS * n for n in (WORLDS, 2 * WORLDS, before, before + worlds, before + 2 * worlds)]
+    assert [e.step for e in logs.Scalars("lower/target")] == expected
+
+
 def test_logged_rewards_are_means_over_the_iteration(tmp_path: Path):
     runner = make_runner(tmp_path, 1)
     seen: list[float] = []

@@ -100,7 +100,7 @@ class DualRunner(OnPolicyRunner):
         if init_at_random_ep_len and first == 0:
             env.episode_length_buf = torch.randint_like(env.episode_length_buf, high=int(env.max_episode_length))
         write_json(self.run_dir / "config.json", self.config)
-        writer = SummaryWriter(str(self.run_dir), purge_step=first * alg.cfg.steps * env.num_envs + 1)
+        writer = SummaryWriter(str(self.run_dir), purge_step=env.samples + 1)  # pyright: ignore[reportAttributeAccessIssue]
         precision = str(alg.dtype).removeprefix("torch.")
         tqdm.write(f"{env.num_envs} worlds, networks {alg.cfg.hidden} in {precision} on {self.device}, {self.run_dir}")
         obs = self._observations()
@@ -133,7 +133,7 @@ class DualRunner(OnPolicyRunner):
                 }
                 self.current_learning_iteration = it + 1
                 for key, value in scalars.items():
-                    writer.add_scalar(key, value, (it + 1) * batch)
+                    writer.add_scalar(key, value, env.samples)  # pyright: ignore[reportAttributeAccessIssue]
                 bar.update()
                 bar.set_postfix_str(_summary(scalars))
                 if (it + 1) % self.runner_cfg.save_interval == 0:

@@ -424,7 +424,7 @@ class H1Env(VecEnv):
         slope = (measured * commanded).sum(0) / commanded.square().sum(0).clamp_min(1e-6)
         error = (measured - commanded).abs()
         arm_error = (r.state.joint_pos[:, self.num_lower :] - r.reference.position)[ok].norm(dim=1)
-        swing_speed = r.state.foot_pos_w[ok][:, :, 2].amax(1)
+        highest_foot = r.state.foot_pos_w[ok][:, :, 2].amax(1)
         return {
             "/command/error_velocity": _mean((measured - commanded)[:, :2].norm(dim=1)),
             "/command/error_yaw_rate": _mean(error[:, 2]),
@@ -433,7 +433,7 @@ class H1Env(VecEnv):
             "/command/slope_y": slope[1],
             "/command/slope_yaw": slope[2],
             "/command/e_upper": _mean(arm_error),
-            "/command/highest_foot": _mean(swing_speed),
+            "/command/highest_foot": _mean(highest_foot),
             "/episode/falls_per_s": fell.float().mean() / self.dt,
             "/episode/time_outs_per_s": time_out.float().mean() / self.dt,
             "/episode/diverged": torch.tensor(float(self.num_diverged)),

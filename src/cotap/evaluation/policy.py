@@ -44,8 +44,10 @@ def load_policy(path: Path | str) -> Policy:
         CheckpointError: the file cannot be used.
     """
     content = load_checkpoint(path)
-    layout, weights = content["layout"], content["model"]
-    agents = content["agents"]
+    for part in ("layout", "model", "agents", "config", "kind"):
+        if part not in content:
+            raise CheckpointError(f"checkpoint {str(path)!r} lacks its part {part!r}")
+    layout, weights, agents = content["layout"], content["model"], content["agents"]
     slices = {name: slice(*bounds) for name, bounds in agents["action_slices"].items()}
     hidden = tuple(content["config"]["training"]["ppo"]["hidden"])
     model = DualActorCritic(AgentLayout(agents["observation_widths"], agents["obs_groups"], slices), hidden, 1.0)
