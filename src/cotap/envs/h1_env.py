@@ -345,7 +345,7 @@ class H1Env(VecEnv):
         for i, body in enumerate(self._hand_bodies):
             self.sim.apply_force(body, self._hand_force_w[:, i], lever_w[:, i])
         share = self.cfg.assist.share(self.samples)
-        if share > 0.0 or self.cfg.assist.enabled:
+        if self.cfg.assist.enabled:
             command = self.commands.current()
             error_h = torch.nn.functional.pad(command.velocity_h - s.torso_linear_velocity_h[:, :2], (0, 1))
             force, torque = assist_wrench(
