@@ -22,7 +22,7 @@ from cotap.agents.dual_ppo import DualPPOConfig
 from cotap.agents.runner import DualRunner, RunnerConfig, check_run_dir
 
 TARGETS = {"lower": (0.8, -0.5, 0.3), "upper": (-0.7, 0.6)}
-TINY = {"hidden": (8, 8), "steps": 6, "epochs": 2, "mini_batches": 2, "precision": "fp32"}
+TINY = {"hidden": (8, 8), "steps": 6, "epochs": 2, "mini_batches": 2, "precision": "fp32", "least_std": 10.0}
 
 
 class DummyEnv(VecEnv):

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from cotap.compliance.kinematics import SerialChains
-from cotap.envs.state import chains_between
+from cotap.robots.chains import chains_between
 
 ATOL = 2e-6  # float32 chains against float64 MuJoCo
 

@@ -35,7 +35,7 @@ def change_all(config: Any) -> Any:
         elif isinstance(value, bool):
             changes[f.name] = not value
         elif isinstance(value, tuple):
-            changes[f.name] = tuple(v + 1 for v in value)
+            changes[f.name] = tuple(v + type(v)(1) for v in value) or ("new",)
         else:
             changes[f.name] = value + type(value)(1)
     return dataclasses.replace(config, **changes)

@@ -5,9 +5,10 @@ import math
 import pytest
 import torch
 
-from cotap.envs.commands import CommandConfig, CommandSource, desired_contact, swing_progress
+from cotap.envs.commands import CommandConfig, CommandSource, leaning
 
-NOMINAL, DT = 1.028, 0.02
+NOMINAL, DT = 1.0205, 0.02
+AT_ONCE = {"acceleration": 1000.0, "yaw_acceleration": 1000.0}
 
 
 def source(num_envs=1, **cfg) -> CommandSource:
@@ -20,11 +21,15 @@ def everyone(n) -> torch.Tensor:
 
 def test_draws_follow_ranges_and_shares(rng):
     n = 20_000
-    commands = source(n)
+    commands = source(n, **AT_ONCE)
     commands.reset(everyone(n), rng)
+    assert not commands.current().velocity_h.any()  # from rest
+    assert torch.equal(commands.current().height, torch.full((n,), NOMINAL))  # the height starts at nominal
+    phase = commands.current().phase
+    commands.step(rng)
     c = commands.current()
     walking = c.stand == 0
-    assert float(c.stand.mean()) == pytest.approx(0.2, abs=0.015)
+    assert float(c.stand.mean()) == pytest.approx(0.3, abs=0.015)
     for values, low, high in (
         (c.velocity_h[walking, 0], -1.1, 1.1),
         (c.velocity_h[walking, 1], -0.6, 0.6),
@@ -36,9 +41,9 @@ def test_draws_follow_ranges_and_shares(rng):
         assert float(values.mean()) == pytest.approx(0.0, abs=0.02)
     assert not c.velocity_h[~walking].any()
     assert not c.yaw_rate[~walking].any()
-    assert torch.equal(c.height, torch.full((n,), NOMINAL))  # the height starts at nominal
-    assert not c.phase[~walking].any()
-    assert float(c.phase[walking].mean()) == pytest.approx(0.5, abs=0.02)
+    assert float((phase[~walking] == 0.5).float().mean()) == pytest.approx(0.5, abs=0.02)
+    assert ((phase[~walking] == 0.5) | (phase[~walking] == 0.0)).all()
+    assert float(phase[walking].mean()) == pytest.approx(0.5, abs=0.02)
 
 
 def test_height_is_commanded_in_stance_only_and_approached_at_its_rate(rng):
@@ -62,8 +67,9 @@ def test_height_is_commanded_in_stance_only_and_approached_at_its_rate(rng):
 
 
 def test_commands_are_held_and_then_resampled(rng):
-    commands = source(1, resample_s=(0.1, 0.1), stand_probability=0.0, axis_zero_probability=0.0)
+    commands = source(1, resample_s=(0.1, 0.1), stand_probability=0.0, axis_zero_probability=0.0, **AT_ONCE)
     commands.reset(everyone(1), rng)
+    commands.step(rng)
     seen = [commands.current().velocity_h[0, 0].item()]
     for _ in range(20):
         commands.step(rng)
@@ -76,12 +82,14 @@ def test_commands_are_held_and_then_resampled(rng):
 def test_reset_touches_only_its_worlds(rng):
     commands = source(2, stand_probability=0.0, axis_zero_probability=0.0)
     commands.reset(everyone(2), rng)
+    commands.step(rng)
     before = commands.current()
     commands.reset(torch.tensor([False, True]), rng)
     after = commands.current()
     assert torch.equal(before.velocity_h[0], after.velocity_h[0])
     assert before.phase[0] == after.phase[0]
-    assert (before.velocity_h[1] != after.velocity_h[1]).all()
+    assert (before.velocity_h[1] != 0.0).all()
+    assert (after.velocity_h[1] == 0.0).all()
 
 
 def test_phase_runs_one_stride_a_period_and_rests_in_stance(rng):
@@ -95,7 +103,85 @@ def test_phase_runs_one_stride_a_period_and_rests_in_stance(rng):
     for _ in range(39):
         commands.step(rng)
     assert float(commands.current().phase[0]) == pytest.approx(float(start[0]), abs=1e-5)
-    assert commands.current().phase[1] == 0.0
+    assert commands.current().phase[1] in (0.0, 0.5)
+
+
+def test_velocities_are_approached_at_their_rates(rng):
+    commands = source(1, acceleration=1.0, yaw_acceleration=2.0)
+    commands.override(torch.tensor([[0.5, -0.1]]), torch.tensor([0.8]), torch.zeros(1), torch.tensor([NOMINAL]))
+    commands.reset(everyone(1), rng)
+    for _ in range(10):
+        commands.step(rng)
+    c = commands.current()
+    assert c.velocity_h.tolist() == [[pytest.approx(0.2), pytest.approx(-0.1)]]
+    assert float(c.yaw_rate) == pytest.approx(0.4)
+    for _ in range(20):
+        commands.step(rng)
+    assert commands.current().velocity_h.tolist() == [[pytest.approx(0.5), pytest.approx(-0.1)]]
+
+
+def test_a_robot_told_to_stand_slows_down_and_ends_its_step(rng):
+    """From 0.3 m/s at 1.5 m/s^2: 0.2 s, then on to the next double support; a new command sets it going from there."""
+    commands = source(1)
+    walk = (torch.tensor([[0.3, 0.0]]), torch.zeros(1), torch.zeros(1), torch.tensor([NOMINAL]))
+    commands.override(*walk)
+    commands.reset(everyone(1), rng)
+    for _ in range(30):
+        commands.step(rng)
+    commands._phase = torch.tensor([0.12])
+    commands.override(torch.zeros(1, 2), torch.zeros(1), torch.ones(1), torch.tensor([NOMINAL]))
+    phases, stands, speeds = [], [], []
+    for _ in range(30):
+        commands.step(rng)
+        c = commands.current()
+        phases.append(float(c.phase))
+        stands.append(float(c.stand))
+        speeds.append(float(c.velocity_h[0, 0]))
+    assert speeds[8] == pytest.approx(0.03)
+    assert speeds[9] == pytest.approx(0.0, abs=1e-6)
+    # 0.38 of a stride of 0.8 s is 15.2 control steps: the sixteenth reaches double support.
+    assert stands == [0.0] * 15 + [1.0] * 15
+    assert phases[14] == pytest.approx(0.12 + 15 * 0.02 / 0.8)
+    assert phases[15:] == [0.5] * 15
+    commands.override(*walk)
+    commands.step(rng)
+    assert float(commands.current().stand) == 0.0
+    assert float(commands.current().phase) == pytest.approx(0.525)
+
+
+def test_a_standing_robot_that_leans_steps_until_it_is_steady(rng):
+    commands = source(1, stand_probability=1.0, height_offset=(-0.2, -0.2))
+    commands.override(torch.zeros(1, 2), torch.zeros(1), torch.ones(1), torch.tensor([NOMINAL - 0.2]))
+    commands.reset(everyone(1), rng)
+    for _ in range(60):
+        commands.step(rng, torch.tensor([0.24]))
+    assert float(commands.current().stand) == 1.0
+    assert float(commands.current().height) == pytest.approx(NOMINAL - 0.2)
+    start = float(commands.current().phase)
+    stands = []
+    for i in range(60):
+        commands.step(rng, torch.tensor([0.26 if i < 25 else 0.1]))
+        stands.append(float(commands.current().stand))
+    # Half a stride is 20 steps: at the first double support it still leans, at the second it is steady.
+    assert stands[:38] == [0.0] * 38
+    assert stands[42:] == [1.0] * 18
+    assert float(commands.current().phase) == start
+    walking = source(1)
+    walking.override(torch.zeros(1, 2), torch.zeros(1), torch.zeros(1), torch.tensor([NOMINAL]))
+    walking.reset(everyone(1), rng)
+    walking.step(rng, torch.tensor([9.0]))
+    assert float(walking.current().stand) == 0.0
+
+
+def test_leaning_by_hand():
+    upright, forward = torch.tensor([[0.0, 0.0, -1.0]]), torch.tensor([[0.1, 0.0, -math.sqrt(0.99)]])
+    still = torch.zeros(1, 3)
+    assert float(leaning(upright, still)) == 0.0
+    assert float(leaning(forward, still)) == pytest.approx(0.1)
+    # Pitching forward (about +y) at 0.2 rad/s: 0.06 rad further in 0.3 s; backward undoes as much.
+    assert float(leaning(forward, torch.tensor([[0.0, 0.2, 0.0]]))) == pytest.approx(0.16, abs=1e-3)
+    assert float(leaning(forward, torch.tensor([[0.0, -0.2, 0.0]]))) == pytest.approx(0.04, abs=1e-3)
+    assert float(leaning(upright, torch.tensor([[0.0, 0.0, 5.0]]))) == 0.0
 
 
 def test_override_holds_through_resets_and_steps(rng):
@@ -111,31 +197,17 @@ def test_override_holds_through_resets_and_steps(rng):
     assert float(c.height) == pytest.approx(0.9)
 
 
-def test_set_velocity_replaces_velocities_only(rng):
-    commands = source(1, stand_probability=1.0)
-    commands.reset(everyone(1), rng)
-    commands.set_velocity(torch.tensor([[0.5, 0.1]]), torch.tensor([-0.3]))
+def test_set_velocity_makes_its_worlds_walk_at_once(rng):
+    commands = source(2, stand_probability=1.0)
+    commands.reset(everyone(2), rng)
+    velocity, turn = torch.tensor([[0.5, 0.1], [9.0, 9.0]]), torch.tensor([-0.3, 9.0])
+    commands.set_velocity(velocity, turn, torch.tensor([True, False]))
     c = commands.current()
-    assert c.velocity_h.tolist() == [[pytest.approx(0.5), pytest.approx(0.1)]]
-    assert float(c.yaw_rate) == pytest.approx(-0.3)
-    assert float(c.stand) == 1.0
-
-
-@pytest.mark.parametrize(
-    ("phase", "left", "right"),
-    [(0.0, True, True), (0.05, True, True), (0.1, True, False), (0.49, True, False), (0.55, True, True),
-     (0.6, False, True), (0.95, False, True)],
-)  # fmt: skip
-def test_desired_contact_alternates(phase, left, right):
-    assert desired_contact(torch.tensor([phase]), torch.zeros(1), 2).tolist() == [[left, right]]
-    assert desired_contact(torch.tensor([phase]), torch.ones(1), 2).tolist() == [[True, True]]
-
-
-def test_swing_progress_runs_from_lift_off_to_touch_down():
-    phase = torch.tensor([0.3, 0.58, 0.79, 0.999])
-    left = swing_progress(phase, 2)[:, 0]
-    torch.testing.assert_close(left, torch.tensor([0.0, 0.0, 0.5, 0.9976]), atol=1e-3, rtol=0)
-    torch.testing.assert_close(swing_progress(phase - 0.5, 2)[:, 1], left, atol=1e-5, rtol=0)
+    assert c.velocity_h.tolist() == [[pytest.approx(0.5), pytest.approx(0.1)], [0.0, 0.0]]
+    assert c.yaw_rate.tolist() == [pytest.approx(-0.3), 0.0]
+    assert c.stand.tolist() == [0.0, 1.0]
+    commands.step(rng)
+    assert commands.current().velocity_h[0].tolist() == [pytest.approx(0.5), pytest.approx(0.1)]
 
 
 def test_state_dict_continues_exactly(rng):
@@ -159,7 +231,8 @@ def test_state_dict_continues_exactly(rng):
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    [("velocity_x", (1.0, -1.0)), ("stand_probability", 1.5), ("gait_period_s", 0.0), ("resample_s", (0.0, 1.0)),
+    [("acceleration", 0.0), ("yaw_acceleration", math.inf), ("velocity_x", (1.0, -1.0)),
+     ("stand_probability", 1.5), ("gait_period_s", 0.0), ("resample_s", (0.0, 1.0)),
      ("yaw_rate", (math.nan, 1.0))],
 )  # fmt: skip
 def test_bad_fields_are_named(field, value):

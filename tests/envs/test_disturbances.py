@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from cotap.envs.disturbances import AssistConfig, HandForceConfig, HandForces, assist_wrench
+from cotap.envs.disturbances import Assistance, AssistConfig, HandForceConfig, HandForces, assist_wrench
 
 DT = 0.02
 STRONG = torch.full((2, 4), 1e6)
@@ -88,15 +88,56 @@ def test_disabled_forces_are_zero(rng):
     assert not hands.current(torch.ones(3, 2, 3, 4), STRONG).any()
 
 
-@pytest.mark.parametrize(
-    ("samples", "share"),
-    # From 1 to 0 along an exponential with an end value of 0.02: halfway (sqrt(0.02) - 0.02) / 0.98.
-    [(0, 1.0), (100, 1.0), (200, 0.363327), (300, 0.123899), (500, 0.0), (10_000, 0.0)],
-)
-def test_assistance_fades_on_schedule(samples, share):
-    cfg = AssistConfig(enabled=True, full_samples=100, end_samples=500)
-    assert cfg.share(samples) == pytest.approx(share, abs=1e-5)
-    assert AssistConfig(full_samples=100, end_samples=500).share(samples) == 0.0
+def assistance(num_envs=100, **cfg) -> Assistance:
+    return Assistance(AssistConfig(enabled=True, full_samples=0, fade_samples=1000, **cfg), num_envs, 0.02)
+
+
+def test_assistance_fades_by_e_while_nothing_falls_and_ends():
+    a = assistance()
+    shares = []
+    for i in range(60):
+        a.step(torch.zeros(100, dtype=torch.bool), 100.0 * (i + 1))
+        shares.append(a.share(100.0 * (i + 1)))
+    assert shares[9] == pytest.approx(math.exp(-1.0), abs=1e-5)
+    assert shares[19] == pytest.approx(math.exp(-2.0), abs=1e-5)
+    assert shares[38] == pytest.approx(math.exp(-3.9), abs=1e-5)
+    assert shares[39:] == [0.0] * 21  # below 2 %
+    a.step(torch.ones(100, dtype=torch.bool), 1e4)
+    assert a.share(1e4) == 0.0  # gone for good
+
+
+def test_assistance_stays_at_its_fall_rate_and_grows_beyond():
+    """One world in 100 falls every second step: 0.25 falls per second and world."""
+    now_and_then = [torch.arange(100) < 1, torch.zeros(100, dtype=torch.bool)]
+    levels = {}
+    for fall_rate in (0.25, 0.1):
+        a = assistance(fall_rate=fall_rate)
+        a._share, a._fall_rate = torch.tensor(0.5), torch.tensor(0.25)
+        for i in range(20):
+            a.step(now_and_then[i % 2], 100.0)
+        levels[fall_rate] = a.share(100.0)
+    assert levels[0.25] == pytest.approx(0.5, abs=0.02)
+    assert levels[0.1] == pytest.approx(1.0)  # by e in ten steps, but never beyond 1
+    assert levels[0.1] <= 1.0
+
+
+def test_the_fall_rate_is_averaged_over_a_second():
+    a = assistance()
+    a.step(torch.arange(100) < 10, 1.0)
+    assert float(a._fall_rate) == pytest.approx(0.02 * 0.1 / 0.02)
+    for _ in range(50):
+        a.step(torch.zeros(100, dtype=torch.bool), 1.0)
+    assert float(a._fall_rate) == pytest.approx(0.1 * 0.98**50)
+
+
+def test_assistance_is_full_at_first_ends_at_last_and_can_be_off():
+    a = Assistance(AssistConfig(enabled=True, full_samples=500, fade_samples=1000, end_samples=2000), 100, 0.02)
+    a.step(torch.zeros(100, dtype=torch.bool), 500.0)
+    assert a.share(500.0) == 1.0
+    a.step(torch.zeros(100, dtype=torch.bool), 600.0)
+    assert a.share(600.0) == pytest.approx(math.exp(-0.1))
+    assert a.share(2000.0) == 0.0
+    assert Assistance(AssistConfig(), 100, 0.02).share(0.0) == 0.0
 
 
 def wrench(up, rate=(0, 0, 0), velocity=(0, 0), yaw_rate=0.0, height=0.0, climb=0.0):

@@ -66,8 +66,8 @@ def test_is_the_environment(make_env):
     np.testing.assert_array_equal(observation, worlds.reset()["policy"])
     rng = torch.Generator().manual_seed(0)
     ended = 0
-    for _ in range(50):
-        action = torch.randn(3, 19, generator=rng)
+    for _ in range(150):
+        action = 2.0 * torch.randn(3, 19, generator=rng)
         observation, reward, termination, truncation, infos = vector.step(action.numpy())
         expected, expected_reward, done, extras = worlds.step(action)
         np.testing.assert_array_equal(observation, expected["policy"])

@@ -17,9 +17,10 @@ from cotap.envs.h1_env import ActionConfig
 from cotap.envs.motions import MotionConfig
 from cotap.envs.observations import NoiseConfig, ObservationConfig, actor_terms
 from cotap.envs.randomization import RandomizationConfig
+from cotap.envs.reference import ClipConfig, ReferenceConfig
 from cotap.envs.terminations import TerminationConfig
 
-STILL = MotionConfig(hold=1.0, reach=0.0, punch=0.0, wave=0.0, swing=0.0)
+STILL = ReferenceConfig(MotionConfig(hold=1.0, reach=0.0, punch=0.0, wave=0.0, swing=0.0), ClipConfig(share=0.0))
 NOMINAL = RandomizationConfig(enabled=False)
 FREE_HANDS = HandForceConfig(enabled=False)
 NOISY = ObservationConfig(noise=NoiseConfig(enabled=True))
@@ -92,8 +93,8 @@ def test_observation_is_wired_to_what_it_names(make_env):
         "joint_position": env.sim.qpos[:, 7:].float() - default,
         "joint_velocity": env.sim.qvel[:, 6:].float(),
         "last_action": action,
-        "sin_phase": torch.sin(2 * math.pi * c.phase)[:, None],
-        "cos_phase": torch.cos(2 * math.pi * c.phase)[:, None],
+        "sin_phase": ((1 - c.stand) * torch.sin(2 * math.pi * c.phase))[:, None],
+        "cos_phase": ((1 - c.stand) * torch.cos(2 * math.pi * c.phase))[:, None],
     }
     for name, value in expected.items():
         torch.testing.assert_close(got[name], value, atol=1e-5, rtol=1e-5, msg=lambda m, name=name: f"{name}: {m}")
@@ -208,8 +209,8 @@ def test_actions_are_clipped_and_left_alone(make_env):
 def stand_or_walk(env, stand: list[float], phase: list[float]) -> None:
     """Fixed commands, at these phases of the stride."""
     n = env.num_envs
-    env.commands.override(torch.zeros(n, 2), torch.zeros(n), torch.tensor(stand), torch.full((n,), 1.028))
-    env.commands._phase = torch.tensor(phase)
+    env.commands.override(torch.zeros(n, 2), torch.zeros(n), torch.tensor(stand), torch.full((n,), 1.0205))
+    env.commands._phase, env.commands._stand = torch.tensor(phase), torch.tensor(stand)
 
 
 def test_targets_by_hand(make_env):
@@ -219,8 +220,8 @@ def test_targets_by_hand(make_env):
     stand_or_walk(env, [1.0, 1.0], [0.0, 0.0])
     env.motions.hold(torch.linspace(0.1, 0.8, 8))
     target = env.target_from_action(action)
-    assert float(target[0, 3]) == pytest.approx(0.4 + 0.25 * 2.0)  # knee: default plus scaled action
-    assert float(target[0, 2]) == pytest.approx(-0.2)
+    assert float(target[0, 3]) == pytest.approx(0.45 + 0.25 * 2.0)  # knee: default plus scaled action
+    assert float(target[0, 2]) == pytest.approx(-0.13)
     assert float(target[0, 11]) == pytest.approx(0.1 - 0.1 * 3.0)  # shoulder: reference plus scaled residual
     assert float(target[1, 18]) == pytest.approx(0.8 + 0.1)
     absolute = make_env(2, actions=ActionConfig(upper_mode="absolute"))
@@ -231,7 +232,7 @@ def test_targets_by_hand(make_env):
 
 def test_the_gait_clock_lifts_the_swinging_leg(make_env):
     """Worlds: both feet down, left leg at the top of its swing (phase 0.79), right leg halfway up (0.5 + 0.685)."""
-    env = make_env(3, actions=ActionConfig(step_flexion=0.5))
+    env = make_env(3, actions=ActionConfig(step_lift=0.5))
     stand_or_walk(env, [1.0, 0.0, 0.0], [0.0, 0.79, 0.185])
     target = env.target_from_action(torch.zeros(3, 19))
     default = torch.tensor([j.default_rad for j in env.spec.joints])
@@ -305,13 +306,14 @@ def test_hand_forces_act_at_the_hands_in_the_heading_frame(make_env):
 
 def test_assistance_pulls_towards_the_command_and_fades(make_env):
     assist = AssistConfig(
-        enabled=True, full_samples=20, end_samples=40, velocity_gain=300.0, force_limit=150.0, yaw_gain=50.0,
+        enabled=True, full_samples=20, fade_samples=20, end_samples=40, velocity_gain=300.0,
+        force_limit=150.0, yaw_gain=50.0,
         weight_share=0.25, height_stiffness=0.0, height_damping=0.0,
     )  # fmt: skip
     env = make_env(2, assist=assist, hand_forces=FREE_HANDS, randomization=NOMINAL)
-    env.commands.override(
-        torch.tensor([[10.0, 0.0], [0.0, 10.0]]), torch.tensor([2.0, -2.0]), torch.zeros(2), torch.full((2,), 1.028)
-    )
+    ten, two = torch.tensor([[10.0, 0.0], [0.0, 10.0]]), torch.tensor([2.0, -2.0])
+    env.commands.override(ten, two, torch.zeros(2), torch.full((2,), 1.0205))
+    env.commands.set_velocity(ten, two, torch.ones(2, dtype=torch.bool))
     forward = env.state.heading_w[0, :2, 0].double()
     left = env.state.heading_w[1, :2, 1].double()
     env.step(torch.zeros(2, 19))
@@ -320,9 +322,9 @@ def test_assistance_pulls_towards_the_command_and_fades(make_env):
     torch.testing.assert_close(wrench[1, :2], 150.0 * left, rtol=0.03, atol=5.0)
     assert wrench[:, 2].tolist() == [pytest.approx(0.25 * 51.437 * 9.81)] * 2
     assert wrench[0, 5] > 50.0 > -50.0 > wrench[1, 5]
-    for _ in range(14):  # 30 samples after 15 steps of two worlds; the wrench of a step is that of its beginning
+    for _ in range(14):  # 28 samples before the last of 15 steps of two worlds, 8 of them beyond the first 20
         env.step(torch.zeros(2, 19))
-    assert env.sim.xfrc[0, 1, 2] == pytest.approx(0.25 * 51.437 * 9.81 * (0.02**0.4 - 0.02) / 0.98)
+    assert env.sim.xfrc[0, 1, 2] == pytest.approx(0.25 * 51.437 * 9.81 * math.exp(-8 / 20))
     for _ in range(6):
         env.step(torch.zeros(2, 19))
     assert not env.sim.xfrc[:, 1].any()
@@ -385,7 +387,7 @@ def test_ended_worlds_restart_within_the_step(make_env):
     rollout(env, 8)
     knock_over(env, 1)
     obs, *_ = env.step(torch.ones(3, 19))
-    assert env.state.height[1] == pytest.approx(1.038, abs=1e-4)
+    assert env.state.height[1] == pytest.approx(1.0305, abs=1e-4)
     now = newest(obs["policy"])
     assert not now["last_action"][1].any()
     assert now["last_action"][0].all()
@@ -437,7 +439,7 @@ def test_a_diverged_world_is_ended_and_counted_and_harms_no_other(make_env, fiel
     for group in ("policy", "privileged"):
         assert torch.isfinite(obs[group]).all()
         assert torch.equal(obs[group][others], twin_obs[group][others])
-    assert env.state.height[2] == pytest.approx(1.038, abs=1e-4)
+    assert env.state.height[2] == pytest.approx(1.0305, abs=1e-4)
     assert torch.isfinite(rollout(env, 5)).all()
     assert env.num_diverged == 1
 
@@ -457,10 +459,10 @@ def test_falling_and_lasting_move_the_force_curriculum(make_env):
     env = make_env(2, terminations=TerminationConfig(episode_s=0.2), hand_forces=HandForceConfig(curriculum_start=0.5))
     knock_over(env, 1)
     env.step(torch.zeros(2, 19))
-    torch.testing.assert_close(env.hand_forces.scale, torch.tensor([0.5, 0.45]))
+    torch.testing.assert_close(env.hand_forces.scale, torch.tensor([0.5, 0.35]))
     for _ in range(9):
         env.step(torch.zeros(2, 19))
-    torch.testing.assert_close(env.hand_forces.scale, torch.tensor([0.55, 0.45]))
+    torch.testing.assert_close(env.hand_forces.scale, torch.tensor([0.65, 0.35]))
 
 
 def test_log_measures_the_slope_of_measured_against_commanded(make_env):
@@ -468,7 +470,9 @@ def test_log_measures_the_slope_of_measured_against_commanded(make_env):
     env.step(torch.zeros(2, 19))
     measured = env.state.torso_linear_velocity_h[:, :2]
     zero = torch.zeros(2)
-    env.commands.override(torch.tensor([[1.0, 0.0], [-0.5, 0.2]]), zero + 0.3, zero, zero + 1.028)
+    walk = torch.tensor([[1.0, 0.0], [-0.5, 0.2]])
+    env.commands.override(walk, zero + 0.3, zero, zero + 1.0205)
+    env.commands.set_velocity(walk, zero + 0.3, torch.ones(2, dtype=torch.bool))
     _, _, done, extras = env.step(torch.zeros(2, 19))
     assert not done.any()
     measured = env.state.torso_linear_velocity_h[:, 0]

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from cotap.envs.impedance import ImpedanceConfig, TorsoImpedance
+from cotap.envs.impedance import ImpedanceConfig, PathFollower, TorsoImpedance
 
 DT = 0.02
 ALIGNED = torch.eye(3).unsqueeze(0)
@@ -97,3 +97,53 @@ def test_reset_stops_only_its_worlds():
 def test_bad_fields_are_named():
     with pytest.raises(ValueError, match=r"impedance\.mass_kg must lie in"):
         TorsoImpedance(ImpedanceConfig(mass_kg=0.0), 1, DT)
+
+
+def turned(yaw: float) -> torch.Tensor:
+    c, s = math.cos(yaw), math.sin(yaw)
+    return torch.tensor([[[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]])
+
+
+def test_a_torso_that_obeys_follows_a_circle(rng):
+    """Path: 0.5 m/s forward, turning at 0.25 rad/s, from where and whither the torso stands."""
+    follower = PathFollower(ImpedanceConfig(share=1.0), 1, DT)
+    x, yaw = torch.tensor([[3.0, -2.0]]), 1.0
+    follower.reset(torch.ones(1, dtype=torch.bool), x, turned(yaw), rng)
+    assert follower.active.tolist() == [True]
+    for _ in range(1000):
+        velocity, yaw_rate = follower.step(x, turned(yaw), torch.tensor([[0.5, 0.0, 0.25]]))
+        x = x + DT * (turned(yaw)[:, :2, :2] @ velocity.unsqueeze(2)).squeeze(2)
+        yaw += DT * float(yaw_rate)
+    assert yaw == pytest.approx(1.0 + 20.0 * 0.25, abs=0.02)
+    center = torch.tensor([[3.0 - 2.0 * math.sin(1.0), -2.0 + 2.0 * math.cos(1.0)]])
+    assert float((x - center).norm()) == pytest.approx(2.0, abs=0.08)
+    assert float((x - follower.target_w).norm()) < 0.08
+
+
+def test_a_path_waits_for_a_torso_that_does_not_follow(rng):
+    follower = PathFollower(ImpedanceConfig(share=1.0, leash_m=0.5), 1, DT)
+    still = torch.zeros(1, 2)
+    follower.reset(torch.ones(1, dtype=torch.bool), still, ALIGNED, rng)
+    for _ in range(500):
+        velocity, yaw_rate = follower.step(still, ALIGNED, torch.tensor([[3.0, 0.0, 2.0]]))
+    assert 0.5 <= float(follower.target_w.norm()) < 0.57
+    assert float(velocity.norm()) <= 1.0 + 1e-5
+    assert abs(float(yaw_rate)) <= 0.9
+
+
+def test_share_decides_how_many_worlds_are_led(rng):
+    n = 4000
+    follower = PathFollower(ImpedanceConfig(share=0.3), n, DT)
+    follower.reset(torch.ones(n, dtype=torch.bool), torch.zeros(n, 2), ALIGNED.expand(n, 3, 3), rng)
+    assert float(follower.active.float().mean()) == pytest.approx(0.3, abs=0.03)
+
+
+def test_path_state_continues_exactly(rng):
+    a, b = (PathFollower(ImpedanceConfig(share=1.0), 1, DT) for _ in range(2))
+    a.reset(torch.ones(1, dtype=torch.bool), torch.ones(1, 2), ALIGNED, rng)
+    go = torch.tensor([[0.5, 0.1, 0.2]])
+    for _ in range(10):
+        a.step(torch.ones(1, 2), ALIGNED, go)
+    b.load_state_dict(a.state_dict())
+    for f, g in zip(a.step(torch.ones(1, 2), ALIGNED, go), b.step(torch.ones(1, 2), ALIGNED, go), strict=True):
+        assert torch.equal(f, g)

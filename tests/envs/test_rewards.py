@@ -9,10 +9,9 @@ import pytest
 import torch
 
 from cotap.compliance.kinematics import ChainPose
-from cotap.envs import rewards
 from cotap.envs.commands import Command
 from cotap.envs.motions import ArmReference
-from cotap.envs.rewards import LowerRewards, RewardGroup, StepRecord, UpperRewards
+from cotap.envs.rewards import TERMS, LowerRewards, RewardGroup, StepRecord, UpperRewards
 from cotap.envs.state import RobotState
 
 DT = 0.02
@@ -64,6 +63,7 @@ def perfect() -> StepRecord:
         key_points_reference_t=points.clone(),
         key_velocities_t=torch.zeros(1, 2, 3),
         key_velocities_reference_t=torch.zeros(1, 2, 3),
+        mean_error=torch.zeros(1, 3),
         fell=torch.tensor([False]),
         joint_low=torch.full((5,), -0.5),
         joint_high=torch.full((5,), 0.5),
@@ -89,10 +89,12 @@ def changed(**changes) -> StepRecord:
     return record
 
 
+AT_REST = {"velocity_h": [[0.0, 0.0]], "torso_linear_velocity_h": [[0.0, 0.0, 0.0]]}
 # What each term gives when all is right.
 BEST = {
-    "track_velocity": 1.0, "track_velocity_closely": 1.0, "track_yaw_rate": 1.0, "track_yaw_rate_closely": 1.0,
-    "track_height": 1.0, "contact_schedule": 1.0, "alive": 1.0, "track_arms": 1.0,
+    "track_velocity": 1.0, "track_velocity_closely": 1.0, "track_mean_velocity": 1.0, "track_yaw_rate": 1.0,
+    "track_yaw_rate_closely": 1.0,
+    "track_height": 1.0, "track_height_widely": 1.0, "contact_schedule": 1.0, "alive": 1.0, "track_arms": 1.0,
     "track_key_points": 1.0, "track_key_velocities": 1.0,
 }  # fmt: skip
 ALL_TERMS = sorted({f.name for group in (LowerRewards, UpperRewards) for f in dataclasses.fields(group)})
@@ -100,18 +102,25 @@ ALL_TERMS = sorted({f.name for group in (LowerRewards, UpperRewards) for f in da
 
 @pytest.mark.parametrize("term", ALL_TERMS)
 def test_a_perfect_step(term):
-    assert getattr(rewards, term)(perfect()).tolist() == [pytest.approx(BEST.get(term, 0.0), abs=1e-6)]
+    assert TERMS[term](perfect()).tolist() == [pytest.approx(BEST.get(term, 0.0), abs=1e-6)]
 
 
+STANDING = {"stand": [1.0]}  # still moving at (0.5, -0.2) m/s: heading to a point (0.15, -0.06) m on
 TURNED_IN = torch.tensor([[[math.cos(0.3), -math.sin(0.3), 0.0], [1.0, 0.0, 0.0]]])
 CASES = [
     ("track_velocity", {"torso_linear_velocity_h": [[0.2, 0.2, 0.0]]}, math.exp(-(0.09 + 0.16) / 0.25)),
     ("track_velocity", {"torso_linear_velocity_h": [[0.5, -0.2, 9.0]]}, 1.0),
     ("track_velocity_closely", {"velocity_h": [[0.6, -0.2]]}, math.exp(-0.01 / 0.04)),
-    ("track_yaw_rate", {"yaw_rate": [0.1]}, math.exp(-0.09 / 0.25)),
-    ("track_yaw_rate_closely", {"yaw_rate": [0.3]}, math.exp(-0.01 / 0.03)),
-    ("track_yaw_rate_closely", {"yaw_rate": [0.5]}, math.exp(-0.01 / 0.03)),
+    ("track_mean_velocity", {"mean_error": [[0.1, -0.05, 9.0]]}, math.exp(-(0.01 + 0.0025) / 0.015)),
+    ("track_yaw_rate", {"yaw_rate": [0.1]}, math.exp(-0.09)),
+    ("track_yaw_rate_closely", {"yaw_rate": [0.3]}, math.exp(-0.01 / 0.06)),
+    ("track_yaw_rate_closely", {"yaw_rate": [0.5]}, math.exp(-0.01 / 0.06)),
     ("track_height", {"torso_pos_w": [[3.0, -2.0, 0.96]]}, math.exp(-0.0016 / 0.0025)),
+    ("track_height_widely", {"torso_pos_w": [[3.0, -2.0, 0.8]]}, math.exp(-0.04 / 0.04)),
+    # Standing 0.1 m behind the middle of the feet, heading to (0.05, -0.06) m of it.
+    ("balance", {**STANDING, "torso_pos_w": [[2.9, -2.0, HEIGHT]]}, math.exp(-(0.05**2 + 0.06**2) / 0.01)),
+    ("balance", {**STANDING, "heading_w": matrix_about_z(math.pi / 2)}, math.exp(-(0.06**2 + 0.15**2) / 0.01)),
+    ("balance", {"torso_pos_w": [[2.9, -2.0, HEIGHT]]}, 0.0),
     ("upright", {"projected_gravity_t": [[0.3, -0.4, -math.sqrt(0.75)]]}, 0.25),
     ("vertical_velocity", {"torso_linear_velocity_h": [[0.5, -0.2, -0.3]]}, 0.09),
     ("roll_pitch_rate", {"torso_angular_velocity_t": [[0.3, -0.4, 7.0]]}, 0.25),
@@ -159,7 +168,7 @@ CASES = [
 
 @pytest.mark.parametrize(("term", "changes", "expected"), CASES)
 def test_by_hand(term, changes, expected):
-    assert getattr(rewards, term)(changed(**changes)).tolist() == [pytest.approx(expected, abs=1e-5)]
+    assert TERMS[term](changed(**changes)).tolist() == [pytest.approx(expected, abs=1e-5)]
 
 
 def test_every_term_has_a_case_by_hand():
@@ -171,7 +180,7 @@ def test_every_term_has_a_case_by_hand():
 def test_no_fault_pays(weights, changes):
     """With the default weights: a weight of the wrong sign would pay for a fault."""
     group = RewardGroup("group", weights, DT)
-    _, best = group(perfect())
+    _, best = group(changed(stand=changes.get("stand", [0.0]), **AT_REST))
     _, terms = group(changed(**changes))
     assert all(float(terms[name]) <= float(best[name]) + 1e-9 for name in terms)
 
@@ -183,8 +192,8 @@ def test_every_field_is_a_function_and_weights_it(cls):
         setattr(weights, field.name, 3.0)
         group = RewardGroup("only", weights, DT)
         assert list(group.terms) == [field.name]
-        record = changed(fell=[True], torso_linear_velocity_h=[[0.1, 0.1, 0.1]])
-        value = float(getattr(rewards, field.name)(record))
+        record = changed(fell=[True], stand=[1.0], torso_linear_velocity_h=[[0.1, 0.1, 0.1]])
+        value = float(TERMS[field.name](record))
         once = field.name == "fall"
         total, terms = group(record)
         assert total.tolist() == [pytest.approx(3.0 * value * (1.0 if once else DT), abs=1e-7)]

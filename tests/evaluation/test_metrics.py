@@ -39,6 +39,7 @@ def trajectory(steps: int = 200, worlds: int = 2, **changes: torch.Tensor) -> Tr
         "foot_contact": torch.ones(steps, worlds, 2, dtype=torch.bool),
         "foot_speed": torch.zeros(steps, worlds, 2),
         "foot_height": torch.zeros(steps, worlds, 2),
+        "path_error": torch.full((steps, worlds), math.nan),
         "fell": torch.zeros(steps, worlds, dtype=torch.bool),
     }
     return Trajectory(dt=DT, **(fields | changes))
@@ -184,3 +185,12 @@ def test_what_cannot_be_measured_is_null_with_a_reason():
     result = {"protocol": "p", "method": "m", "num_falls": 0, "num_envs": 1, "seconds": 1.0, "metrics": {"e_lin": s}}
     assert "no world" in table(result)
     json.dumps(s, allow_nan=False)
+
+
+def test_path_error_is_of_worlds_that_follow_a_path():
+    t = trajectory()
+    t.path_error[:, 0] = 0.2
+    t.path_error[100:, 0] = 0.4
+    m = tracking_measures(t, 0.8)
+    assert m["e_path"][0] == pytest.approx(0.3)
+    assert m["e_path"][1].isnan()

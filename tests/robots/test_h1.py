@@ -147,7 +147,7 @@ def test_default_pose_has_its_soles_on_the_floor(spec, model):
     data = mujoco.MjData(model)
     data.qpos[:] = default_qpos(spec, model)
     mujoco.mj_forward(model, data)
-    assert data.body("torso_link").xpos[2] == pytest.approx(1.028)
+    assert data.body("torso_link").xpos[2] == pytest.approx(1.0205)
     for foot in ("left_foot", "right_foot"):
         assert abs(data.site(foot).xpos[2]) < 2e-3
         np.testing.assert_allclose(data.site(foot).xmat.reshape(3, 3)[:, 2], [0, 0, 1], atol=1e-6)
@@ -179,7 +179,7 @@ def test_default_pose_stands_on_its_weight(spec, model):
         mujoco.mj_step(model, data)
         if step >= 25:
             load.append(sum(data.sensor(f"{side}_foot_touch").data[0] for side in ("left", "right")))
-    assert data.qpos[2] == pytest.approx(1.028, abs=0.04)  # PD legs sag a little
+    assert data.qpos[2] == pytest.approx(1.0205, abs=0.04)  # PD legs sag a little
     assert data.body("torso_link").xmat.reshape(3, 3)[2, 2] > 0.98
     assert np.mean(load) == pytest.approx(51.437 * 9.81, rel=0.1)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -20,6 +21,7 @@ from cotap.agents.losses import (
 )
 from cotap.agents.precision import PRECISIONS, resolve_precision
 from cotap.checks import require_one_of, require_positive_int, require_range
+from cotap.reflection import Symmetry
 
 
 @dataclass
@@ -30,6 +32,10 @@ class DualPPOConfig:
     """Hidden layers of every actor and critic."""
     initial_std: float = 0.6
     """Standard deviation of actions at the start."""
+    std_half_life: float = 300.0
+    """Iterations in which the largest standard deviation allowed falls by half: wide at first, precise later."""
+    least_std: float = 0.2
+    """Where that fall ends."""
     steps: int = 24
     """Steps per world and iteration."""
     epochs: int = 3
@@ -56,6 +62,8 @@ class DualPPOConfig:
     """auto, bf16 or fp32."""
     normalizer_stride: int = 4
     """Observations of every so many steps update the normalisers."""
+    mirrored_share: float = 0.5
+    """Share of samples that are replaced by their left-right mirror image, where the environment tells what that is."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
@@ -68,8 +76,17 @@ class DualPPOConfig:
             require_positive_int(f"ppo.hidden[{i}]", width)
         require_range("ppo.gamma", self.gamma, 0.0, 1.0)
         require_range("ppo.lam", self.lam, 0.0, 1.0)
-        for name in ("initial_std", "clip", "learning_rate", "desired_kl", "max_grad_norm"):
-            require_range(f"ppo.{name}", getattr(self, name), 1e-8, 1e3)
+        for name in (
+            "initial_std",
+            "least_std",
+            "std_half_life",
+            "clip",
+            "learning_rate",
+            "desired_kl",
+            "max_grad_norm",
+        ):
+            require_range(f"ppo.{name}", getattr(self, name), 1e-8, 1e6)
+        require_range("ppo.mirrored_share", self.mirrored_share, 0.0, 0.9)
         for name in ("entropy", "value"):
             require_range(f"ppo.{name}", getattr(self, name), 0.0, 1e3)
 
@@ -97,11 +114,16 @@ class DualPPO:
         num_envs: Number of worlds.
         cfg: Hyperparameters.
         device: Where the networks live.
+        symmetry: Mirror images of observations and actions; None for a task that has no symmetry.
     """
 
-    def __init__(self, layout: AgentLayout, num_envs: int, cfg: DualPPOConfig, device: str = "cpu") -> None:
+    def __init__(
+        self, layout: AgentLayout, num_envs: int, cfg: DualPPOConfig, device: str = "cpu",
+        symmetry: Symmetry | None = None,
+    ) -> None:  # fmt: skip
         cfg.check()
         self.cfg, self.device, self.layout = cfg, device, layout
+        self.symmetry = symmetry.to(device) if symmetry and cfg.mirrored_share > 0.0 else None
         self.dtype = resolve_precision(cfg.precision, device)
         self.names = tuple(layout.action_slices)
         self.model = DualActorCritic(layout, cfg.hidden, cfg.initial_std).to(device)
@@ -138,6 +160,7 @@ class DualPPO:
             dones=buffer(1, torch.bool),
         )
         self._step = 0
+        self.iterations = 0
 
     def _autocast(self) -> torch.autocast:
         return torch.autocast(torch.device(self.device).type, torch.bfloat16, enabled=self.dtype == torch.bfloat16)
@@ -148,6 +171,8 @@ class DualPPO:
         t, r, model = self._step, self.rollout, self.model
         if t % self.cfg.normalizer_stride == 0:
             model.update_normalizers(observations)
+            if self.symmetry:  # a mirror image must stay one after normalisation
+                model.update_normalizers({g: self.symmetry.observations[g](observations[g]) for g in model.normalizers})
         for group, value in model.normalize(observations).items():
             r.observations[group][t] = value
         stored = {group: value[t] for group, value in r.observations.items()}
@@ -199,18 +224,44 @@ class DualPPO:
             for ids in torch.randperm(total, device=self.device).chunk(cfg.mini_batches):
                 batch = {key: value[ids] for key, value in flat.items()}
                 inputs = {g: v[ids] for g, v in observations.items()}
+                self._mirror(inputs, batch)
                 with self._autocast():
                     actor_in, critic_in = self.model.read("actor", inputs), self.model.read("critic", inputs)
                 for g, name in enumerate(self.names):
                     stats = self._update_agent(name, g, actor_in, critic_in, batch, old_log_std[name])
                     for key, value in stats.items():
                         sums[f"{name}/{key}"] = sums.get(f"{name}/{key}", torch.zeros(())) + value
+        self.iterations += 1
+        self._limit_std()
         count = cfg.epochs * cfg.mini_batches
         log = {key: float(value) / count for key, value in sums.items()}
         for name in self.names:
             log[f"{name}/learning_rate"] = self.learning_rates[name]
             log[f"{name}/action_std"] = float(self.model.log_std[name].detach().exp().mean())
         return log
+
+    @torch.no_grad()
+    def _limit_std(self) -> None:
+        cfg = self.cfg
+        largest = max(cfg.least_std, cfg.initial_std * 0.5 ** (self.iterations / cfg.std_half_life))
+        for log_std in self.model.log_std.values():
+            log_std.clamp_(max=math.log(max(largest, 1e-8)))
+
+    def _mirror(self, inputs: Observations, batch: dict[str, torch.Tensor]) -> None:
+        """Replace the first samples of a shuffled mini-batch by their mirror images, in place.
+
+        The policy that collected them is taken to be symmetric, so that log-probabilities, values and advantages stay.
+        """
+        if not self.symmetry:
+            return
+        share = slice(0, self._num_mirrored(batch))
+        for group, value in inputs.items():
+            value[share] = self.symmetry.observations[group](value[share])
+        for key in ("actions", "means"):
+            batch[key][share] = self.symmetry.actions(batch[key][share])
+
+    def _num_mirrored(self, batch: dict[str, torch.Tensor]) -> int:
+        return int(self.cfg.mirrored_share * batch["actions"].shape[0]) if self.symmetry else 0
 
     def _update_agent(
         self, name: str, g: int, actor_in: torch.Tensor, critic_in: torch.Tensor, batch: dict[str, torch.Tensor],
@@ -223,7 +274,9 @@ class DualPPO:
             value = model.critics[name](critic_in).squeeze(-1)
         log_std = model.log_std[name]
         with torch.no_grad():
-            kl = gaussian_kl(batch["means"][:, part], old_log_std, mean, log_std).mean()
+            # Of samples as they were collected: a mirrored one's distance holds the policy's own asymmetry as well.
+            own = slice(self._num_mirrored(batch), None)
+            kl = gaussian_kl(batch["means"][own, part], old_log_std, mean[own], log_std).mean()
         self.learning_rates[name] = adapt_learning_rate(self.learning_rates[name], float(kl), cfg.desired_kl)
         log_prob = gaussian_log_prob(batch["actions"][:, part], mean, log_std)
         surrogate = clipped_surrogate(log_prob, batch["log_probs"][:, g], batch["advantages"][:, g], cfg.clip)
@@ -241,10 +294,11 @@ class DualPPO:
         return {"surrogate": surrogate.detach(), "value": value_loss.detach(), "entropy": entropy.detach(), "kl": kl}
 
     def state_dict(self) -> dict[str, Any]:
-        """Optimisers and learning rates; the networks are saved apart."""
+        """Optimisers, learning rates and number of updates; the networks are saved apart."""
         return {
             "optimizers": {name: opt.state_dict() for name, opt in self.optimizers.items()},
             "learning_rates": dict(self.learning_rates),
+            "iterations": self.iterations,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -252,3 +306,4 @@ class DualPPO:
         for name, opt in self.optimizers.items():
             opt.load_state_dict(state["optimizers"][name])
         self.learning_rates = dict(state["learning_rates"])
+        self.iterations = state["iterations"]

@@ -86,7 +86,8 @@ class DualRunner(OnPolicyRunner):
     ) -> None:  # fmt: skip
         cfg.check()
         self.env, self.runner_cfg, self.run_dir, self.config, self.device = env, cfg, run_dir, config, device
-        self.alg: DualPPO = DualPPO(layout_of(env), env.num_envs, ppo, device)  # pyright: ignore
+        symmetry = getattr(env, "symmetry", None)
+        self.alg: DualPPO = DualPPO(layout_of(env), env.num_envs, ppo, device, symmetry)  # pyright: ignore
         self.current_learning_iteration = 0
         self.wall_seconds = 0.0
         self._stop = False

@@ -14,13 +14,18 @@ class ChainPose:
     """Where the links of a chain are, in the frame of its root. W worlds, A chains, n joints."""
 
     anchors: torch.Tensor
-    """Joint origins, (W, A, n, 3) [m]."""
+    """Joint origins, which are the links' origins, (W, A, n, 3) [m]."""
     axes: torch.Tensor
     """Joint axes, (W, A, n, 3), unit vectors."""
-    rotation: torch.Tensor
-    """Orientation of the last link, (W, A, 3, 3)."""
+    rotations: torch.Tensor
+    """Orientation of the links, (W, A, n, 3, 3)."""
     tip: torch.Tensor
     """The tip point on the last link, (W, A, 3) [m]."""
+
+    @property
+    def rotation(self) -> torch.Tensor:
+        """(W, A, 3, 3) orientation of the last link."""
+        return self.rotations[:, :, -1]
 
 
 class SerialChains:
@@ -48,14 +53,16 @@ class SerialChains:
         sine, versine = q.sin()[..., None, None], (1.0 - q.cos())[..., None, None]
         local = self._fixed + sine * self._sine + versine * self._versine  # (W, A, n, 3, 3)
         position, rotation = self.offsets[:, 0].expand(q.shape[0], -1, 3), local[:, :, 0]
+        rotations = [rotation]
         anchors, axes = [position], [(rotation @ self.axes[:, 0, :, None]).squeeze(-1)]
         for i in range(1, self.num_joints):
             position = position + (rotation @ self.offsets[:, i, :, None]).squeeze(-1)
             rotation = rotation @ local[:, :, i]
+            rotations.append(rotation)
             anchors.append(position)
             axes.append((rotation @ self.axes[:, i, :, None]).squeeze(-1))
         tip = position + (rotation @ self.tip[..., None]).squeeze(-1)
-        return ChainPose(torch.stack(anchors, 2), torch.stack(axes, 2), rotation, tip)
+        return ChainPose(torch.stack(anchors, 2), torch.stack(axes, 2), torch.stack(rotations, 2), tip)
 
     @staticmethod
     def jacobian(pose: ChainPose) -> torch.Tensor:

@@ -43,6 +43,7 @@ def default() -> BaseTraining:
     """What the shipped base policy was trained with."""
     training = BaseTraining()
     training.env.assist.enabled = True
+    training.env.num_envs = 1024
     return training
 
 

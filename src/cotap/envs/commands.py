@@ -23,7 +23,7 @@ class CommandConfig:
     """Turning rate, positive to the left [rad/s]."""
     height_offset: tuple[float, float] = (-0.2, 0.0)
     """Torso height relative to nominal while standing [m]."""
-    stand_probability: float = 0.2
+    stand_probability: float = 0.3
     """Share of commands that ask the robot to stand."""
     axis_zero_probability: float = 0.2
     """Chance that each of the three velocities of a walking command is zero."""
@@ -31,6 +31,12 @@ class CommandConfig:
     """Time between commands [s]."""
     height_rate: float = 0.25
     """Fastest change of the height command [m/s]."""
+    acceleration: float = 1.5
+    """Fastest change of each velocity command [m/s^2]."""
+    yaw_acceleration: float = 3.0
+    """Fastest change of the yaw rate command [rad/s^2]."""
+    steady_rad: float = 0.25
+    """A standing robot that is leaning further than this, or is about to, steps in place until it is steady [rad]."""
     gait_period_s: float = 0.8
     """Duration of a stride [s]."""
 
@@ -42,6 +48,9 @@ class CommandConfig:
         require_range("commands.stand_probability", self.stand_probability, 0.0, 1.0)
         require_range("commands.axis_zero_probability", self.axis_zero_probability, 0.0, 1.0)
         require_range("commands.height_rate", self.height_rate, 1e-3, 10.0)
+        require_range("commands.acceleration", self.acceleration, 1e-2, 1e3)
+        require_range("commands.yaw_acceleration", self.yaw_acceleration, 1e-2, 1e3)
+        require_range("commands.steady_rad", self.steady_rad, 0.0, 10.0)
         require_range("commands.gait_period_s", self.gait_period_s, 0.1, 10.0)
 
 
@@ -58,16 +67,19 @@ class Command:
     height: torch.Tensor
     """(N,) height of the torso link above the ground [m]."""
     phase: torch.Tensor
-    """(N,) in [0, 1); 0 while standing. The left foot leads, the right follows half a period later."""
+    """(N,) of the gait clock, in [0, 1); it rests at 0 or 0.5, both feet down, while standing."""
 
 
 class CommandSource(Stateful):
     """Random commands, held for a random time. `override` puts fixed ones in their place.
 
+    What is commanded approaches what was drawn at limited rates, as a pilot's stick does. A robot told to stand slows
+    down, ends its step, and stands: the stand flag is raised once the velocity command is zero and both feet are down,
+    and lowered, for a step or more, when it loses its balance.
     A velocity source (such as the torso-position impedance) may replace the velocities at every step.
     """
 
-    STATE = ("_target", "_height", "_phase", "_remaining_s")
+    STATE = ("_target", "_velocity", "_stand", "_height", "_phase", "_remaining_s")
 
     def __init__(self, cfg: CommandConfig, num_envs: int, nominal_height: float, dt: float) -> None:
         cfg.check()
@@ -75,6 +87,9 @@ class CommandSource(Stateful):
         # Columns: vx, vy, yaw rate, stand, height.
         self._target = torch.zeros(num_envs, 5)
         self._target[:, 4] = nominal_height
+        self._velocity = torch.zeros(num_envs, 3)
+        self._stand = torch.zeros(num_envs)
+        self._rate = dt * torch.tensor([cfg.acceleration, cfg.acceleration, cfg.yaw_acceleration])
         self._height = torch.full((num_envs,), nominal_height)
         self._phase = torch.zeros(num_envs)
         self._remaining_s = torch.zeros(num_envs)
@@ -83,35 +98,64 @@ class CommandSource(Stateful):
     def override(
         self, velocity: torch.Tensor, yaw_rate: torch.Tensor, stand: torch.Tensor, height: torch.Tensor
     ) -> None:
-        """Hold these commands, (N, 2), (N,), (N,), (N,), until further notice; the height is reached at its rate."""
+        """Hold these commands, (N, 2), (N,), (N,), (N,), until further notice; each is approached at its rate."""
         self.resample = False
         self._target = torch.cat((velocity, torch.stack((yaw_rate, stand.float(), height), 1)), 1)
 
-    def set_velocity(self, velocity: torch.Tensor, yaw_rate: torch.Tensor) -> None:
-        """Replace the velocities (N, 2) and yaw rates (N,) of this step."""
-        self._target[:, :2], self._target[:, 2] = velocity, yaw_rate
+    def set_velocity(self, velocity: torch.Tensor, yaw_rate: torch.Tensor, mask: torch.Tensor) -> None:
+        """In the worlds of `mask` (N,), walk at these velocities (N, 2) and yaw rates (N,), at once."""
+        walk = torch.cat((velocity, yaw_rate.unsqueeze(1)), 1)
+        self._target[:, :3] = torch.where(mask.unsqueeze(1), walk, self._target[:, :3])
+        self._target[:, 3] = torch.where(mask, torch.zeros_like(self._stand), self._target[:, 3])
+        self._target[:, 4] = torch.where(mask, torch.full_like(self._stand, self._nominal), self._target[:, 4])
+        self._velocity = torch.where(mask.unsqueeze(1), walk, self._velocity)
+        self._stand = torch.where(mask, torch.zeros_like(self._stand), self._stand)
 
     def reset(self, mask: torch.Tensor, rng: torch.Generator) -> None:
-        """New commands for the worlds in `mask`; the height command starts at nominal."""
+        """New commands for the worlds in `mask`, approached from rest at nominal height."""
         self._draw(mask, rng)
         self._height[mask] = self._nominal
+        self._velocity[mask] = 0.0
+        stand = self._target[mask, 3]
+        self._stand[mask] = stand
         # A random start in the stride, so that worlds are not in step with each other.
-        n = int(mask.sum())
-        self._phase[mask] = torch.rand(n, generator=rng) * (1.0 - self._target[mask, 3])
+        start = torch.rand(int(mask.sum()), generator=rng)
+        self._phase[mask] = torch.where(stand > 0.5, 0.5 * (start < 0.5), start)
 
-    def step(self, rng: torch.Generator) -> None:
-        """Advance clocks by one control step and resample what is due."""
+    def step(self, rng: torch.Generator, lean: torch.Tensor | None = None) -> None:
+        """Advance clocks by one control step and resample what is due.
+
+        Args:
+            rng: Random numbers.
+            lean: (N,) how far each robot is about to lean [rad], from `leaning`; None counts as upright.
+        """
         self._remaining_s -= self._dt
         self._draw(self._remaining_s <= 0.0, rng)
         limit = self.cfg.height_rate * self._dt
-        self._height = self._height + (self._target[:, 4] - self._height).clamp(-limit, limit)
-        walking = 1.0 - self._target[:, 3]
-        self._phase = (self._phase + self._dt / self.cfg.gait_period_s).remainder(1.0) * walking
+        # Stepping is done at nominal height.
+        wanted = torch.where(self._stand > 0.5, self._target[:, 4], self._target[:, 4].clamp_min(self._nominal))
+        self._height = self._height + (wanted - self._height).clamp(-limit, limit)
+        self._velocity = self._velocity + (self._target[:, :3] - self._velocity).clamp(-self._rate, self._rate)
+        self._advance_gait(torch.zeros_like(self._phase) if lean is None else lean)
+
+    def _advance_gait(self, lean: torch.Tensor) -> None:
+        """Run the clock while walking; come to rest at the next double support, 0 or 0.5, once asked to and steady."""
+        steady = lean <= self.cfg.steady_rad
+        half_strides = 2.0 * (self._phase + self._dt / self.cfg.gait_period_s)
+        both_down = half_strides.floor() > (2.0 * self._phase).floor()
+        at_rest = (self._velocity == 0.0).all(1) & (self._target[:, 3] > 0.5) & steady
+        stays = (self._stand > 0.5) & (self._target[:, 3] > 0.5) & steady
+        stops = ~stays & at_rest & both_down
+        running = 0.5 * torch.where(stops, half_strides.floor(), half_strides)
+        self._phase = torch.where(stays, self._phase, running.remainder(1.0))
+        self._stand = (stays | stops).float()
 
     def current(self) -> Command:
         """The commands now."""
-        t = self._target
-        return Command(t[:, :2].clone(), t[:, 2].clone(), t[:, 3].clone(), self._height.clone(), self._phase.clone())
+        v = self._velocity
+        return Command(
+            v[:, :2].clone(), v[:, 2].clone(), self._stand.clone(), self._height.clone(), self._phase.clone()
+        )
 
     def _draw(self, mask: torch.Tensor, rng: torch.Generator) -> None:
         n = int(mask.sum())
@@ -132,16 +176,13 @@ class CommandSource(Stateful):
         self._remaining_s[mask] = uniform(rng, *cfg.resample_s, n)
 
 
-def desired_contact(
-    phase: torch.Tensor, stand: torch.Tensor, num_feet: int, stance_share: float = 0.58
-) -> torch.Tensor:
-    """Which feet should be on the ground, (N, num_feet) bool: foot i is i / num_feet ahead."""
-    shift = torch.arange(num_feet, dtype=phase.dtype) / num_feet
-    return ((phase.unsqueeze(1) + shift).remainder(1.0) < stance_share) | (stand.unsqueeze(1) > 0.5)
+def leaning(projected_gravity_t: torch.Tensor, angular_velocity_t: torch.Tensor, ahead_s: float = 0.3) -> torch.Tensor:
+    """How far (N,) a torso will lean `ahead_s` from now if it goes on turning as it does [rad]; an IMU measures it.
 
-
-def swing_progress(phase: torch.Tensor, num_feet: int, stance_share: float = 0.58) -> torch.Tensor:
-    """How far each foot is through its swing, (N, num_feet) in [0, 1]; 0 during stance."""
-    shift = torch.arange(num_feet, dtype=phase.dtype) / num_feet
-    foot_phase = (phase.unsqueeze(1) + shift).remainder(1.0)
-    return ((foot_phase - stance_share) / (1.0 - stance_share)).clamp(0.0, 1.0)
+    Args:
+        projected_gravity_t: (N, 3) unit vector of gravity in the torso frame.
+        angular_velocity_t: (N, 3) [rad/s].
+        ahead_s: About the time constant of falling [s].
+    """
+    rate = torch.linalg.cross(projected_gravity_t, angular_velocity_t)
+    return (projected_gravity_t + ahead_s * rate)[:, :2].norm(dim=1)

@@ -30,7 +30,7 @@ class HandForceConfig:
     """Forces are scaled down to what this share of the arm's torque limits can hold."""
     curriculum_start: float = 0.0
     """Share of the force with which worlds begin."""
-    curriculum_step: float = 0.05
+    curriculum_step: float = 0.15
     """Change of a world's share after an episode: up when it lasted, down when the robot fell early."""
 
     def check(self) -> None:
@@ -93,7 +93,7 @@ _LAST_SHARE = 0.02
 
 @dataclass
 class AssistConfig:
-    """A wrench on the base that carries the robot through its first steps and fades to nothing.
+    """A wrench on the base that carries the robot through its first steps and fades as it learns to do without.
 
     Without it, standing still is a local optimum that plain reward tables do not leave.
     """
@@ -102,8 +102,12 @@ class AssistConfig:
     """Whether to assist; training switches it on."""
     full_samples: float = 4e5
     """Environment steps, over all worlds, with full assistance."""
-    end_samples: float = 5e6
-    """Environment steps after which there is none."""
+    fade_samples: float = 8e5
+    """Environment steps in which it fades by a factor of e while nothing falls."""
+    fall_rate: float = 0.1
+    """Falls per second and world at which it stays; beyond, it grows again [1/s]."""
+    end_samples: float = 8e6
+    """Environment steps after which there is none, whatever falls."""
     upright_stiffness: float = 300.0
     """[Nm/rad]."""
     upright_damping: float = 30.0
@@ -124,6 +128,8 @@ class AssistConfig:
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
         require_range("assist.full_samples", self.full_samples, 0.0, self.end_samples)
+        require_range("assist.fade_samples", self.fade_samples, 1.0, 1e12)
+        require_range("assist.fall_rate", self.fall_rate, 1e-6, 1e6)
         require_range("assist.weight_share", self.weight_share, 0.0, 1.0)
         for name in (
             "upright_stiffness",
@@ -136,17 +142,37 @@ class AssistConfig:
         ):
             require_range(f"assist.{name}", getattr(self, name), 0.0, 1e6)
 
-    def share(self, samples: float) -> float:
-        """Share of the assistance left after `samples` environment steps.
 
-        It fades exponentially: a gantry of half the gains still holds the robot, so equal times go to equal ratios.
-        """
-        if not self.enabled or samples >= self.end_samples:
+class Assistance(Stateful):
+    """How much of the assistance is left: less and less as long as robots stay on their feet.
+
+    It fades exponentially: a gantry of half the gains still holds the robot, so equal times go to equal ratios.
+    """
+
+    STATE = ("_share", "_fall_rate")
+
+    def __init__(self, cfg: AssistConfig, num_envs: int, dt: float) -> None:
+        cfg.check()
+        self.cfg, self._num_envs, self._dt = cfg, num_envs, dt
+        self._share = torch.ones(())
+        self._fall_rate = torch.zeros(())
+
+    def share(self, samples: float) -> float:
+        """Share of the assistance left after `samples` environment steps."""
+        left = float(self._share)
+        if not self.cfg.enabled or samples >= self.cfg.end_samples or left < _LAST_SHARE:
             return 0.0
-        if samples <= self.full_samples:
-            return 1.0
-        progress = (samples - self.full_samples) / (self.end_samples - self.full_samples)
-        return (_LAST_SHARE**progress - _LAST_SHARE) / (1.0 - _LAST_SHARE)
+        return left
+
+    def step(self, falls: torch.Tensor, samples: float) -> None:
+        """Learn of the falls (N,) of one control step; falls are averaged over about a second."""
+        rate = falls.float().mean() / self._dt
+        self._fall_rate = self._fall_rate + self._dt * (rate - self._fall_rate)
+        if samples <= self.cfg.full_samples or self._share < _LAST_SHARE:
+            return  # not yet, or gone for good
+        direction = (1.0 - self._fall_rate / self.cfg.fall_rate).clamp(-1.0, 1.0)
+        progress = self._num_envs / self.cfg.fade_samples
+        self._share = (self._share * torch.exp(-progress * direction)).clamp_max(1.0)
 
 
 def assist_wrench(

@@ -12,9 +12,10 @@ from tensordict import TensorDict
 
 from cotap.checks import require_all_finite, require_one_of, require_positive_int, require_range, require_shape
 from cotap.compliance.kinematics import ChainPose
-from cotap.envs.commands import CommandConfig, CommandSource, desired_contact, swing_progress
-from cotap.envs.disturbances import AssistConfig, HandForceConfig, HandForces, assist_wrench
-from cotap.envs.motions import MotionConfig, MotionGenerator
+from cotap.envs.commands import CommandConfig, CommandSource, leaning
+from cotap.envs.disturbances import Assistance, AssistConfig, HandForceConfig, HandForces, assist_wrench
+from cotap.envs.gait import StepMotion, desired_contact, swing_progress
+from cotap.envs.impedance import ImpedanceConfig, PathFollower
 from cotap.envs.observations import (
     ObservationConfig,
     ObservationHistory,
@@ -24,9 +25,13 @@ from cotap.envs.observations import (
 )
 from cotap.envs.persistence import uniform
 from cotap.envs.randomization import RandomizationConfig, Randomizer
+from cotap.envs.reference import ReferenceConfig, ReferenceMotion
 from cotap.envs.rewards import LowerRewards, RewardGroup, StepRecord, UpperRewards, check_weights
 from cotap.envs.state import RobotState, StateReader
+from cotap.envs.symmetry import actor_reflection, critic_reflection, joint_reflection
 from cotap.envs.terminations import TerminationConfig, diverged, fallen
+from cotap.envs.upper_body import UpperBody, UpperBodyConfig
+from cotap.reflection import Symmetry
 from cotap.robots import ROBOTS
 from cotap.robots.mjcf import COLLISIONS, build_model
 from cotap.rotations import quat_about_z, quat_from_matrix, rotate
@@ -41,10 +46,16 @@ class ActionConfig:
 
     lower_scale: float = 0.25
     """Radians per unit of lower action, added to the default pose."""
-    step_flexion: float = 1.0
-    """Share of the stepping motion that the gait clock feeds forward to the legs; 0 leaves all to the policy."""
+    twist_scale: float = 0.1
+    """The same of the joints that turn about the vertical, hip yaw and waist: less, so that exploring shakes less."""
+    step_lift: float = 1.0
+    """Share of the swinging foot's lift that the gait clock feeds forward to the legs; 0 leaves it to the policy."""
+    step_stride: float = 1.0
+    """Share of the feet's sweep at the commanded velocity that is fed forward; 0 leaves it to the policy."""
     upper_scale: float = 0.1
     """Radians per unit of upper action, added to the reference (residual) or to the default pose (absolute)."""
+    reference_lead_s: float = 0.03
+    """How far ahead of the arms' reference their targets run [s]: what damping and delay hold back."""
     upper_mode: str = "residual"
     """residual (FALCON) or absolute (the paper)."""
     clip: float = 20.0
@@ -53,8 +64,11 @@ class ActionConfig:
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
         require_range("actions.lower_scale", self.lower_scale, 0.0, 10.0)
-        require_range("actions.step_flexion", self.step_flexion, 0.0, 2.0)
+        require_range("actions.step_lift", self.step_lift, 0.0, 2.0)
+        require_range("actions.step_stride", self.step_stride, 0.0, 2.0)
+        require_range("actions.twist_scale", self.twist_scale, 0.0, 10.0)
         require_range("actions.upper_scale", self.upper_scale, 0.0, 10.0)
+        require_range("actions.reference_lead_s", self.reference_lead_s, 0.0, 1.0)
         require_range("actions.clip", self.clip, 1e-3, 1e6)
         require_one_of("actions.upper_mode", self.upper_mode, ("residual", "absolute"))
 
@@ -88,9 +102,11 @@ class H1EnvConfig:
     torque_limit_scale: float = 1.0
     """Factor on the robot's torque limits."""
     actions: ActionConfig = field(default_factory=ActionConfig)
+    upper_body: UpperBodyConfig = field(default_factory=UpperBodyConfig)
     observations: ObservationConfig = field(default_factory=ObservationConfig)
     commands: CommandConfig = field(default_factory=CommandConfig)
-    motions: MotionConfig = field(default_factory=MotionConfig)
+    motions: ReferenceConfig = field(default_factory=ReferenceConfig)
+    impedance: ImpedanceConfig = field(default_factory=ImpedanceConfig)
     rewards: RewardConfig = field(default_factory=RewardConfig)
     terminations: TerminationConfig = field(default_factory=TerminationConfig)
     randomization: RandomizationConfig = field(default_factory=RandomizationConfig)
@@ -105,8 +121,10 @@ class H1EnvConfig:
         require_one_of("collision", self.collision, COLLISIONS)
         require_range("control_dt", self.control_dt, 1e-4, 1.0)
         require_range("torque_limit_scale", self.torque_limit_scale, 1e-3, 1e3)
-        for part in (self.actions, self.observations, self.commands, self.motions, self.terminations, self.hand_forces,
-                     self.assist):  # fmt: skip
+        for part in (
+            self.actions, self.upper_body, self.observations, self.commands, self.motions, self.impedance,
+            self.terminations, self.hand_forces, self.assist,
+        ):  # fmt: skip
             part.check()
         self.randomization.check(self.control_dt)
         check_weights("lower", self.rewards.lower)
@@ -157,10 +175,11 @@ class H1Env(VecEnv):
         self._sideways = tuple(
             i for i, j in enumerate(joints[: self.num_lower]) if j.mirror_sign < 0.0
         )  # yaw and roll joints
-        self._flexion_joints = torch.tensor([spec.indices([n for n, _ in f.flexion]) for f in spec.feet])
-        flexion = torch.tensor([[angle for _, angle in f.flexion] for f in spec.feet])
-        self._flexion = cfg.actions.step_flexion * flexion
+        self._step_motion = StepMotion(
+            spec, model, cfg.commands.gait_period_s, cfg.actions.step_lift, cfg.actions.step_stride
+        )
         self._action_scale = torch.full((self.num_actions,), cfg.actions.lower_scale)
+        self._action_scale[[j.axis == (0.0, 0.0, 1.0) for j in joints]] = cfg.actions.twist_scale
         self._action_scale[self.num_lower :] = cfg.actions.upper_scale
 
         self.reader = StateReader(spec, self.sim)
@@ -176,9 +195,12 @@ class H1Env(VecEnv):
         self._weight_n = float(model.body_mass.sum()) * GRAVITY
 
         self.commands = CommandSource(cfg.commands, n, spec.nominal_height_m, self.dt)
-        self.motions = MotionGenerator(cfg.motions, spec, n, self.dt)
+        self.motions = ReferenceMotion(cfg.motions, spec, n, self.dt)
+        self.path = PathFollower(cfg.impedance, n, self.dt)
         self.hand_forces = HandForces(cfg.hand_forces, n, len(spec.arms), self.dt)
+        self.assistance = Assistance(cfg.assist, n, self.dt)
         self.randomizer = Randomizer(cfg.randomization, spec, self.sim)
+        self.upper_body = UpperBody(cfg.upper_body, spec, n)
         self.targets = DelayedTargets(n, self.num_actions, cfg.substeps, self.dt)
         terms = actor_terms(self.num_actions, self.num_actions - self.num_lower)
         self.history = ObservationHistory(terms, n, cfg.observations.history)
@@ -194,6 +216,7 @@ class H1Env(VecEnv):
         self.num_diverged = 0
         self.episode_length_buf = torch.zeros(n, dtype=torch.long)
         self._last_action = torch.zeros(n, self.num_actions)
+        self._mean_error = torch.zeros(n, 3)
         self._hand_force_w = torch.zeros(n, len(spec.arms), 3)
         self._kp, self._kd = self.randomizer.gains()
         self.randomizer.randomize_bodies(self.rng)
@@ -205,6 +228,16 @@ class H1Env(VecEnv):
         """Which observation groups actors and critics read (rsl_rl's `obs_groups`)."""
         noisy = self.cfg.observations.noise.enabled
         return {"actor": ["policy"], "critic": ["clean" if noisy else "policy", "privileged"]}
+
+    @property
+    def symmetry(self) -> Symmetry:
+        """The mirror images of observations and actions."""
+        terms, steps = self.history.terms, self.history.steps
+        actor = actor_reflection(self.spec, terms, steps)
+        critic = critic_reflection(self.spec, critic_terms(len(self.spec.arms)))
+        return Symmetry(
+            {"policy": actor, "clean": actor, "privileged": critic}, joint_reflection(self.spec, self.spec.joint_names)
+        )
 
     def layout(self) -> dict[str, Any]:
         """What a policy must agree with: robot, joints, observation terms, action convention."""
@@ -249,6 +282,7 @@ class H1Env(VecEnv):
         # The reference moves first: arms are sent where it will be, and judged against that, at the end of the step.
         self.motions.step(self.rng)
         self.targets.send(self.target_from_action(action))
+        self._send_to_arms()
         velocity_before = self.state.joint_vel
         self._apply_forces()
         self.sim.step(self._drive)
@@ -257,10 +291,13 @@ class H1Env(VecEnv):
         self.state = self.reader.read()
         self.samples += self.num_envs
         self.episode_length_buf += 1
-        self.commands.step(self.rng)
+        s = self.state
+        self.commands.step(self.rng, leaning(s.projected_gravity_t, s.torso_angular_velocity_t))
+        self._follow_path()
         self.hand_forces.step(self.rng)
 
         fell = fallen(self.cfg.terminations, self.state.height, self.state.projected_gravity_t) | bad
+        self.assistance.step(fell, self.samples)
         time_out = (self.episode_length_buf >= self.max_episode_length) & ~fell
         record = self._record(action, velocity_before, fell)
         self.record = record
@@ -275,15 +312,25 @@ class H1Env(VecEnv):
         extras = {"time_outs": time_out, "falls": fell, "group_rewards": rewards, "log": log}
         return self._observations, rewards.sum(1), done, extras
 
+    def _follow_path(self) -> None:
+        """Where the torso is led along a path, that sets the velocity command."""
+        if self.cfg.impedance.share == 0.0:
+            return
+        s = self.state
+        velocity, yaw_rate = self.path.step(s.torso_pos_w[:, :2], s.heading_w, self.motions.root_velocity())
+        self.commands.set_velocity(velocity, yaw_rate, self.path.active)
+
     def target_from_action(self, action: torch.Tensor) -> torch.Tensor:
-        """Joint targets (N, J) [rad] of actions (N, J), for the present gait phase and arm reference."""
+        """Joint targets (N, J) [rad] of actions (N, J), for the present command, gait phase and arm reference."""
         target = self._default + self._action_scale * action
-        swing = swing_progress(self.commands.current().phase, len(self.spec.feet))
-        lift = torch.sin(torch.pi * swing).square()
-        target[:, self._flexion_joints] += lift.unsqueeze(2) * self._flexion
+        c = self.commands.current()
+        step = self._step_motion(c.phase, c.velocity_h, c.yaw_rate)
+        target[:, self._step_motion.joints] += (1.0 - c.stand)[:, None, None] * step
         if self.cfg.actions.upper_mode == "residual":
             upper = slice(self.num_lower, None)
-            target[:, upper] += self.motions.current().position - self._default[upper]
+            reference = self.motions.current()
+            lead = self.cfg.actions.reference_lead_s * reference.velocity
+            target[:, upper] += reference.position + lead - self._default[upper]
         return target
 
     def state_dict(self) -> dict[str, Any]:
@@ -299,6 +346,7 @@ class H1Env(VecEnv):
             },
             "episode_length": self.episode_length_buf.clone(),
             "last_action": self._last_action.clone(),
+            "mean_error": self._mean_error.clone(),
             "observations": dict(self._observations.items()),
             "counters": {"samples": self.samples, "num_diverged": self.num_diverged},
             "rng": self.rng.get_state(),
@@ -314,6 +362,7 @@ class H1Env(VecEnv):
         self._kp, self._kd = self.randomizer.gains()
         self.episode_length_buf = state["episode_length"].clone()
         self._last_action = state["last_action"].clone()
+        self._mean_error = state["mean_error"].clone()
         self._observations = TensorDict(state["observations"], batch_size=[self.num_envs])
         self.samples = state["counters"]["samples"]
         self.num_diverged = state["counters"]["num_diverged"]
@@ -324,15 +373,43 @@ class H1Env(VecEnv):
         return {
             "commands": self.commands,
             "motions": self.motions,
+            "path": self.path,
+            "upper_body": self.upper_body,
             "hand_forces": self.hand_forces,
+            "assistance": self.assistance,
             "randomizer": self.randomizer,
             "history": self.history,
             "clean_history": self._clean_history,
         }
 
+    def _send_to_arms(self) -> None:
+        """Ask the arms' laws for this control step, and let the simulator integrate the stiffness' diagonal."""
+        if not self.upper_body.active:
+            return
+        arms = slice(self.num_lower, None)
+        self.upper_body.send(self.state, self.targets.current[:, arms])
+        kp, kd = self.upper_body.implicit_gains()
+        self._kp[:, arms], self._kd[:, arms] = kp, kd
+        bias = self.sim.field("actuator_biasprm")
+        bias[:, arms, 1], bias[:, arms, 2] = -kp.double(), -kd.double()
+
     def _drive(self, substep: int) -> torch.Tensor:
-        """PD control: the actuators subtract `kp q + kd dq` themselves."""
-        return self._kp * self.targets.at(substep)
+        """What actuators are given, which subtract `kp q + kd dq` themselves: PD, and the arms' laws on top."""
+        control = self._kp * self.targets.at(substep)
+        if self.upper_body.active:
+            arms = slice(self.num_lower, None)
+            q = self.sim.qpos[:, 7 + self.num_lower :].float()
+            dq = self.sim.qvel[:, 6 + self.num_lower :].float()
+            control[:, arms] = (
+                self._arm_torque(q, dq, self.targets.arrived(substep)) + self._kp[:, arms] * q + self._kd[:, arms] * dq
+            )
+        return control
+
+    def _arm_torque(self, q: torch.Tensor, dq: torch.Tensor, arrived: torch.Tensor) -> torch.Tensor:
+        """Torque (N, U) that the arms' laws ask for, gains as randomised."""
+        arms = slice(self.num_lower, None)
+        scales = self.randomizer.kp_scale[:, arms], self.randomizer.kd_scale[:, arms]
+        return self.upper_body.torque(q, dq, arrived, *scales)
 
     def _apply_forces(self) -> None:
         s = self.state
@@ -344,7 +421,7 @@ class H1Env(VecEnv):
         lever_w = rotate(hand_rotation_w, self._hand_lever)
         for i, body in enumerate(self._hand_bodies):
             self.sim.apply_force(body, self._hand_force_w[:, i], lever_w[:, i])
-        share = self.cfg.assist.share(self.samples)
+        share = self.assistance.share(self.samples)
         if self.cfg.assist.enabled:
             command = self.commands.current()
             error_h = torch.nn.functional.pad(command.velocity_h - s.torso_linear_velocity_h[:, :2], (0, 1))
@@ -377,6 +454,7 @@ class H1Env(VecEnv):
             key_points_reference_t=ref_points,
             key_velocities_t=velocities,
             key_velocities_reference_t=ref_velocities,
+            mean_error=self._average_error(),
             fell=fell,
             joint_low=self._soft_limits[0],
             joint_high=self._soft_limits[1],
@@ -385,9 +463,25 @@ class H1Env(VecEnv):
             sideways=self._sideways,
         )
 
+    def _average_error(self) -> torch.Tensor:
+        """Velocity errors (N, 3), averaged exponentially over half a stride."""
+        s, c = self.state, self.commands.current()
+        error = torch.cat((s.torso_linear_velocity_h[:, :2] - c.velocity_h, (s.yaw_rate - c.yaw_rate).unsqueeze(1)), 1)
+        # A world that has diverged is about to restart; its error must not outlast it.
+        error = torch.nan_to_num(error, 0.0, 0.0, 0.0).clamp(-10.0, 10.0)
+        share = 2.0 * self.dt / self.cfg.commands.gait_period_s
+        self._mean_error = torch.lerp(self._mean_error, error, min(share, 1.0))
+        return self._mean_error
+
     def joint_torque(self, state: RobotState) -> torch.Tensor:
         """Torque (N, J) [Nm] that the law in force gives at `state`."""
-        torque = self._kp * (self.targets.at(self.cfg.substeps - 1) - state.joint_pos) - self._kd * state.joint_vel
+        last = self.cfg.substeps - 1
+        torque = self._kp * (self.targets.at(last) - state.joint_pos) - self._kd * state.joint_vel
+        if self.upper_body.active:
+            arms = slice(self.num_lower, None)
+            ruled = self._arm_torque(state.joint_pos[:, arms], state.joint_vel[:, arms], self.targets.arrived(last))
+            # Worlds that have just restarted have been told nothing yet; they hold their PD targets.
+            torque[:, arms] = torch.where(self.upper_body.fresh.unsqueeze(1), torque[:, arms], ruled)
         return torch.clamp(torque, -self._torque_limit, self._torque_limit)
 
     def _key_points(self, arms: ChainPose, rates: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -438,10 +532,13 @@ class H1Env(VecEnv):
             "/episode/time_outs_per_s": time_out.float().mean() / self.dt,
             "/episode/diverged": torch.tensor(float(self.num_diverged)),
             "/curriculum/hand_force": self.hand_forces.scale.mean(),
-            "/curriculum/assist": torch.tensor(self.cfg.assist.share(self.samples)),
+            **self.upper_body.log,
+            "/curriculum/assist": torch.tensor(self.assistance.share(self.samples)),
         }
 
     def _finish(self, done: torch.Tensor, fell: torch.Tensor) -> None:
+        if self.assistance.share(self.samples) > 0.0:
+            return  # what lasts in a gantry proves nothing
         long_enough = self.episode_length_buf >= 0.75 * self.max_episode_length
         self.hand_forces.finish_episodes(done & long_enough, done & fell & ~long_enough)
 
@@ -452,8 +549,9 @@ class H1Env(VecEnv):
         self._kp, self._kd = self.randomizer.gains()
         self.commands.reset(mask, self.rng)
         self.motions.reset(mask, self.rng)
+        self.upper_body.reset(mask)
         self.hand_forces.reset(mask, self.rng)
-        joints = self._default + uniform(self.rng, -0.1, 0.1, n, self.num_actions)
+        joints = self._default + uniform(self.rng, -0.05, 0.05, n, self.num_actions)
         joints[:, self.num_lower :] = self.motions.current().position[mask]
         position = torch.zeros(n, 3)
         position[:, 2] = self.spec.nominal_height_m + 0.01
@@ -463,20 +561,23 @@ class H1Env(VecEnv):
         self.sim.reset(mask, qpos, qvel)
         self.targets.reset(mask, joints)
         self._last_action[mask] = 0.0
+        self._mean_error[mask] = 0.0
         self._hand_force_w[mask] = 0.0
         self.episode_length_buf[mask] = 0
         self.state = self.reader.read()
+        self.path.reset(mask, self.state.torso_pos_w[:, :2], self.state.heading_w, self.rng)
 
     def _observe(self, restarted: torch.Tensor) -> None:
         """Append the present to the history of every world and assemble the observation groups."""
         s, c = self.state, self.commands.current()
-        angle = 2.0 * math.pi * c.phase
+        angle, walking = 2.0 * math.pi * c.phase, 1.0 - c.stand
         present = torch.cat(
             (
                 s.torso_angular_velocity_t, s.projected_gravity_t, c.velocity_h, c.yaw_rate.unsqueeze(1),
                 c.stand.unsqueeze(1), c.height.unsqueeze(1), self.motions.current().position,
-                s.joint_pos - self._default, s.joint_vel, self._last_action, angle.sin().unsqueeze(1),
-                angle.cos().unsqueeze(1), self.joint_torque(s)[:, self.num_lower :],
+                s.joint_pos - self._default, s.joint_vel, self._last_action,
+                (walking * angle.sin()).unsqueeze(1), (walking * angle.cos()).unsqueeze(1),
+                self.joint_torque(s)[:, self.num_lower :],
             ),
             1,
         )  # fmt: skip

@@ -12,7 +12,8 @@ from cotap.envs.persistence import Stateful, uniform
 from cotap.robots import RobotSpec
 
 KINDS = ("hold", "reach", "punch", "wave", "swing")
-_PEAK = 1.875  # peak speed of a minimum-jerk move, in units of distance over duration
+PEAK_SPEED = 1.875
+"""Peak speed of a minimum-jerk move, in units of distance over duration."""
 
 
 @dataclass
@@ -115,7 +116,7 @@ class MotionGenerator(Stateful):
         back = self._out_and_back > 0.5
         u = torch.where(back, 1.0 - (2.0 * s - 1.0).abs(), s)
         rate = torch.where(back, 2.0 * torch.sign(0.5 - s), torch.ones_like(s)) / self._duration_s
-        move, move_rate = _minimum_jerk(u)
+        move, move_rate = minimum_jerk(u)
         angle = 2.0 * math.pi * self._cycles * s
         window, window_rate = torch.sin(math.pi * s).square(), math.pi * torch.sin(2.0 * math.pi * s)
         wave = window * angle.sin()
@@ -142,7 +143,7 @@ class MotionGenerator(Stateful):
         single = torch.maximum(is_kind["punch"], (torch.rand(n, 1, generator=rng) < 0.5).float() * is_kind["reach"])
         goal = start + (goal - start) * torch.where(single > 0.5, own, torch.ones_like(own))
         amplitude = self._oscillation(start, is_kind, rng)
-        fastest = torch.maximum((goal - start).abs() / self._speed, torch.zeros_like(goal)).amax(1) * _PEAK
+        fastest = torch.maximum((goal - start).abs() / self._speed, torch.zeros_like(goal)).amax(1) * PEAK_SPEED
         legs = 1.0 + is_kind["punch"].squeeze(1)
         slack = torch.where(is_kind["punch"].squeeze(1) > 0.5, uniform(rng, 1.0, 1.8, n), uniform(rng, 1.3, 5.0, n))
         duration = (fastest * legs * slack).clamp_min(0.5)
@@ -170,6 +171,6 @@ class MotionGenerator(Stateful):
         return amplitude.sign() * torch.minimum(amplitude.abs(), room)
 
 
-def _minimum_jerk(s: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def minimum_jerk(s: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Position and slope at `s` in [0, 1] of the minimum-jerk profile from 0 to 1."""
     return s**3 * (10.0 - 15.0 * s + 6.0 * s**2), 30.0 * s**2 * (1.0 - s) ** 2

@@ -14,6 +14,7 @@ from cotap.checks import require_finite
 from cotap.envs.commands import Command
 from cotap.envs.motions import ArmReference
 from cotap.envs.state import RobotState
+from cotap.rotations import rotate
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,8 @@ class StepRecord:
     """(N, P, 3) [m/s]."""
     key_velocities_reference_t: torch.Tensor
     """(N, P, 3) [m/s]."""
+    mean_error: torch.Tensor
+    """(N, 3) horizontal velocity [m/s] and yaw rate [rad/s] minus their commands, averaged over about half a stride."""
     fell: torch.Tensor
     """(N,) bool: the episode ends in a fall."""
     joint_low: torch.Tensor
@@ -63,9 +66,12 @@ class LowerRewards:
 
     track_velocity: float = 1.0
     track_velocity_closely: float = 1.5
+    track_mean_velocity: float = 2.0
     track_yaw_rate: float = 0.6
-    track_yaw_rate_closely: float = 1.0
+    track_yaw_rate_closely: float = 1.5
     track_height: float = 0.75
+    track_height_widely: float = 0.4
+    balance: float = 0.75
     upright: float = -3.0
     vertical_velocity: float = -0.5
     roll_pitch_rate: float = -0.05
@@ -116,19 +122,39 @@ def track_velocity_closely(s: StepRecord) -> torch.Tensor:
     return torch.exp(-velocity_error(s) / 0.04)
 
 
+def track_mean_velocity(s: StepRecord) -> torch.Tensor:
+    """Velocity averaged over about half a stride: what sways with every step is no reason to walk too slowly."""
+    return torch.exp(-s.mean_error[:, :2].square().sum(1) / 0.015)
+
+
 def track_yaw_rate(s: StepRecord) -> torch.Tensor:
     """Angular velocity about the vertical against its command, wide kernel."""
-    return torch.exp(-(s.command.yaw_rate - s.state.yaw_rate).square() / 0.25)
+    return torch.exp(-(s.command.yaw_rate - s.state.yaw_rate).square())
 
 
 def track_yaw_rate_closely(s: StepRecord) -> torch.Tensor:
     """As above, narrow kernel."""
-    return torch.exp(-(s.command.yaw_rate - s.state.yaw_rate).square() / 0.03)
+    return torch.exp(-(s.command.yaw_rate - s.state.yaw_rate).square() / 0.06)
 
 
 def track_height(s: StepRecord) -> torch.Tensor:
     """Height of the torso link against its command."""
     return torch.exp(-(s.command.height - s.state.height).square() / 0.0025)
+
+
+def track_height_widely(s: StepRecord) -> torch.Tensor:
+    """As above, wide kernel: a direction to follow from 0.2 m away."""
+    return torch.exp(-(s.command.height - s.state.height).square() / 0.04)
+
+
+def balance(s: StepRecord) -> torch.Tensor:
+    """While standing, closeness of where the torso is heading to to the middle of the feet.
+
+    Where it is heading to is its capture point, position plus velocity times the time constant of falling (0.3 s).
+    """
+    heading_to = s.state.torso_pos_w[:, :2] + 0.3 * rotate(s.state.heading_w, s.state.torso_linear_velocity_h)[:, :2]
+    middle = s.state.foot_pos_w[:, :, :2].mean(1)
+    return s.command.stand * torch.exp(-(heading_to - middle).square().sum(1) / 0.01)
 
 
 def upright(s: StepRecord) -> torch.Tensor:
@@ -279,6 +305,47 @@ def check_weights(name: str, weights: LowerRewards | UpperRewards) -> None:
         require_finite(f"rewards.{name}.{f.name}", getattr(weights, f.name))
 
 
+TERMS: dict[str, Callable[[StepRecord], torch.Tensor]] = {
+    term.__name__: term
+    for term in (
+        track_velocity,
+        track_velocity_closely,
+        track_mean_velocity,
+        track_yaw_rate,
+        track_yaw_rate_closely,
+        track_height,
+        track_height_widely,
+        balance,
+        upright,
+        vertical_velocity,
+        roll_pitch_rate,
+        contact_schedule,
+        swing_height,
+        foot_slip,
+        foot_flat,
+        foot_yaw,
+        feet_apart,
+        sideways_joints,
+        stand_still,
+        lower_torque,
+        lower_acceleration,
+        lower_action_rate,
+        lower_joint_limits,
+        alive,
+        fall,
+        track_arms,
+        track_key_points,
+        track_key_velocities,
+        arm_residual,
+        upper_torque,
+        upper_acceleration,
+        upper_action_rate,
+        upper_joint_limits,
+    )
+}
+"""Every term, by the name of its weight."""
+
+
 ONCE = ("fall",)
 """Terms that are not rates."""
 
@@ -293,7 +360,7 @@ class RewardGroup:
         for f in fields(weights):
             weight = getattr(weights, f.name)
             if weight != 0.0:
-                self.terms[f.name] = (globals()[f.name], weight * (1.0 if f.name in ONCE else dt))
+                self.terms[f.name] = (TERMS[f.name], weight * (1.0 if f.name in ONCE else dt))
 
     def __call__(self, record: StepRecord) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Total reward (N,) of a step, and the weighted terms, (N,) each."""

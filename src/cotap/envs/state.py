@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import torch
 
-from cotap.compliance.kinematics import ChainPose, SerialChains
+from cotap.compliance.kinematics import ChainPose
 from cotap.robots import RobotSpec
+from cotap.robots.chains import arm_chains, chains_between
 from cotap.rotations import heading_matrix, matrix_from_quat, rotate, rotate_inverse
 from cotap.sim import Simulation
 
@@ -67,24 +68,12 @@ class RobotState:
         return self.torso_pos_w[:, 2]
 
 
-def chains_between(spec: RobotSpec, root: str, tips: list[tuple[str, tuple[float, float, float]]]) -> SerialChains:
-    """Kinematic chains from body `root` to points (body, point in its frame), all of equal length."""
-    joint_axes = {j.name: j.axis for j in spec.joints}
-    chains = [spec.chain(body, root) for body, _ in tips]
-    return SerialChains(
-        torch.tensor([[b.pos for b in chain] for chain in chains]),
-        torch.tensor([[b.quat for b in chain] for chain in chains]),
-        torch.tensor([[joint_axes[b.joint or ""] for b in chain] for chain in chains]),
-        torch.tensor([point for _, point in tips]),
-    )
-
-
 class StateReader:
     """Turns a simulation's raw vectors into a `RobotState`."""
 
     def __init__(self, spec: RobotSpec, sim: Simulation) -> None:
         self._sim = sim
-        self.arm_chains = chains_between(spec, spec.torso_body, [(a.hand_body, a.hand_point) for a in spec.arms])
+        self.arm_chains = arm_chains(spec)
         self._waist = chains_between(spec, spec.base_body, [(spec.torso_body, (0.0, 0.0, 0.0))])
         waist = [b.joint or "" for b in spec.chain(spec.torso_body, spec.base_body)]
         self._waist_ids = spec.indices(waist)

@@ -94,6 +94,7 @@ def tracking_measures(t: Trajectory, gait_period_s: float, settle_s: float = 1.0
         "stand_drift": masked_mean(drift, ok_gait & t.stand),
         "foot_slip": torch.where(contact.any(2).any(0), slip, torch.full_like(slip, math.nan)),
         "swing_height": swing_heights(t.foot_height, t.foot_contact, ok & walking, round(0.1 / t.dt)),
+        "e_path": masked_mean(t.path_error, t.alive() & torch.isfinite(t.path_error)),
         "fall_fraction": t.fell.any(0).float(),
         "episode_length_fraction": t.alive().float().mean(0),
     }

@@ -38,6 +38,10 @@ class VelocityTracking:
     """Domain randomisation."""
     arm_motion: bool = True
     """Reference arm motion; otherwise arms hold their default pose."""
+    motion: tuple[str, ...] = ()
+    """Arms follow these clips only; empty keeps the mixture that the policy was trained on."""
+    follow_path: bool = False
+    """Lead the torso along the clips' root path instead of drawing velocity commands."""
     torque_limit_scale: float = 1.0
     """Factor on the robot's torque limits."""
 
@@ -63,6 +67,10 @@ class VelocityTracking:
         env.randomization.enabled = self.randomize
         # Episodes outlast the evaluation: what ends one is a fall.
         env.terminations.episode_s = 2.0 * self.episode_seconds
+        if self.motion:
+            clips = env.motions.clips
+            clips.share, clips.only, clips.held_out = 1.0, self.motion, ()
+        env.impedance.share = float(self.follow_path)
         c = env.commands
         c.velocity_x, c.velocity_y = (-self.speed_x, self.speed_x), (-self.speed_y, self.speed_y)
         c.yaw_rate, c.height_offset = (-self.yaw_rate, self.yaw_rate), (-self.height_drop, 0.0)

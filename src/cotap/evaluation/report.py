@@ -13,7 +13,7 @@ from cotap.evaluation.rollout import Trajectory
 
 UNITS = {
     "e_lin": "m/s", "e_lin_gait": "m/s", "e_yaw": "rad/s", "e_yaw_gait": "rad/s", "e_height": "m", "e_upper": "rad",
-    "e_ee": "m", "j_upper": "Nm", "stand_drift": "m/s", "foot_slip": "m/s", "swing_height": "m",
+    "e_ee": "m", "j_upper": "Nm", "stand_drift": "m/s", "foot_slip": "m/s", "swing_height": "m", "e_path": "m",
 }  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 
@@ -43,6 +44,8 @@ class Trajectory:
     """(T, N, F) horizontal [m/s]."""
     foot_height: torch.Tensor
     """(T, N, F) of the soles' centres [m]."""
+    path_error: torch.Tensor
+    """(T, N) horizontal distance of the torso from where its path has it [m]; NaN in worlds that follow none."""
     fell: torch.Tensor
     """(T, N) bool: the world fell in that step."""
 
@@ -78,5 +81,8 @@ def _row(env: H1Env, fell: torch.Tensor) -> dict[str, torch.Tensor]:
         "foot_contact": s.foot_contact,
         "foot_speed": s.foot_velocity_w[:, :, :2].norm(dim=2),
         "foot_height": s.foot_pos_w[:, :, 2],
+        "path_error": torch.where(
+            env.path.active, (s.torso_pos_w[:, :2] - env.path.target_w).norm(dim=1), torch.full_like(s.height, math.nan)
+        ),
         "fell": fell,
     }

@@ -9,13 +9,14 @@ from typing import Any
 
 from cotap.robots.spec import ArmSpec, BodySpec, FootSpec, GeomSpec, JointSpec, RobotSpec
 
-# kp [Nm/rad], kd [Nms/rad], default angle [rad], velocity limit [rad/s]; Unitree's gains.
+# kp [Nm/rad], kd [Nms/rad], default angle [rad], velocity limit [rad/s]; Unitree's gains. The default pose of the legs
+# has the centre of mass over the middle of the soles.
 _JOINTS: dict[str, tuple[float, float, float, float]] = {
     "hip_yaw": (150.0, 2.0, 0.0, 23.0),
     "hip_roll": (150.0, 2.0, 0.0, 23.0),
-    "hip_pitch": (150.0, 2.0, -0.2, 23.0),
-    "knee": (200.0, 4.0, 0.4, 14.0),
-    "ankle": (40.0, 2.0, -0.2, 9.0),
+    "hip_pitch": (150.0, 2.0, -0.13, 23.0),
+    "knee": (200.0, 4.0, 0.45, 14.0),
+    "ankle": (40.0, 2.0, -0.32, 9.0),
     "torso": (300.0, 6.0, 0.0, 23.0),
     "shoulder_pitch": (100.0, 2.0, 0.0, 9.0),
     "shoulder_roll": (100.0, 2.0, 0.0, 9.0),
@@ -144,6 +145,6 @@ def h1() -> RobotSpec:
         ),
         joint_damping=facts["joint_damping"],
         joint_armature=facts["joint_armature"],
-        nominal_height_m=1.028,
+        nominal_height_m=1.0205,
         colors=_COLORS,
     )

@@ -29,5 +29,8 @@ class DelayedTargets:
 
     def at(self, substep: int) -> torch.Tensor:
         """Mean target over physics step number `substep` of the control step, (num_envs, num_joints)."""
-        arrived = ((substep + 1) * self._physics_dt - self.delay_s).div_(self._physics_dt).clamp_(0.0, 1.0)
-        return torch.lerp(self.previous, self.current, arrived.unsqueeze(1))
+        return torch.lerp(self.previous, self.current, self.arrived(substep).unsqueeze(1))
+
+    def arrived(self, substep: int) -> torch.Tensor:
+        """Share (num_envs,) of physics step number `substep` in which the newest target holds."""
+        return ((substep + 1) * self._physics_dt - self.delay_s).div_(self._physics_dt).clamp_(0.0, 1.0)

@@ -1,0 +1,57 @@
+"""Make the motion library that the package ships, from the DeepMimic clips in the `pybullet` package's data.
+
+    python -m pip install pybullet
+    python scripts/build_motion_library.py [FOLDER]
+
+FOLDER is `pybullet_data/data/motions`; without it, that of the installed package.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+
+import cotap
+from cotap.motions.importer import ImportResult, import_motions, table
+from cotap.motions.library import MotionClip, MotionLibrary
+from cotap.motions.processing import mirror_clip
+from cotap.robots import h1
+
+SOURCE = "DeepMimic (Peng et al., 2018), by way of the pybullet package's data: {file}"
+LICENCE = "MIT"
+
+
+def installed_folder() -> Path:
+    """Where the installed pybullet_data keeps its motions."""
+    found = find_spec("pybullet_data")
+    if found is None or found.origin is None:
+        raise SystemExit("error: pybullet is not installed here; install it, or name the folder of its motions")
+    return Path(found.origin).parent / "data" / "motions"
+
+
+def short_name(name: str) -> str:
+    """`humanoid3d_dance_a` to `dance_a`, `0walk_forward` to `walk_forward`."""
+    return name.removeprefix("humanoid3d_").lstrip("0123456789")
+
+
+def main() -> int:
+    """Import, mirror, name, save, and print the table of quality."""
+    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else installed_folder()
+    spec = h1()
+    result = import_motions([folder], spec, "deepmimic")
+    named = [
+        replace(c, name=short_name(c.name), source=SOURCE.format(file=f"{c.name}.txt"), licence=LICENCE)
+        for c in result.clips
+    ]
+    clips: list[MotionClip] = [clip for c in named for clip in (c, mirror_clip(spec, c))]
+    path = Path(cotap.__file__).parent / "motions" / f"{spec.name}_motions.npz"
+    MotionLibrary(clips, spec).save(path)
+    print(table(ImportResult(clips, result.quality, [c.name for c in named], result.failures)))
+    print(f"\nwritten: {path}, {path.stat().st_size / 1024:.0f} KiB")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

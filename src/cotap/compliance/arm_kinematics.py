@@ -1,0 +1,85 @@
+"""Arms on pytorch-kinematics chains, for use outside of rollouts (which use `SerialChains`, and agree with it)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from cotap.checks import require_all_finite
+
+if TYPE_CHECKING:
+    from cotap.robots import ArmSpec, RobotSpec
+
+
+class ArmKinematics:
+    """Hand positions and Jacobians of a robot's arms, in the frame of the torso link that carries them.
+
+    Args:
+        spec: The robot; by default the Unitree H1. Its arms must have equally many joints.
+        dtype: Of all results.
+        device: Where they are computed.
+    """
+
+    def __init__(
+        self, spec: RobotSpec | None = None, dtype: torch.dtype = torch.float32, device: str | torch.device = "cpu"
+    ) -> None:
+        if spec is None:
+            from cotap.robots import h1
+
+            spec = h1()
+        self.spec, self.dtype, self.device = spec, dtype, torch.device(device)
+        self._chains = [_serial_chain(spec, arm).to(dtype=dtype, device=self.device) for arm in spec.arms]
+        self.num_joints = len(spec.arms[0].joints)
+
+    def hand_position(self, q: torch.Tensor) -> torch.Tensor:
+        """Hands (N, A, 3) [m] for arm joints `q`, (N, A, n) or (N, A n) [rad]. Differentiable.
+
+        Raises:
+            ValueError: `q` has another shape or is not finite.
+        """
+        arms = self._split(q)
+        matrices = [c.forward_kinematics(arms[:, i]).get_matrix() for i, c in enumerate(self._chains)]
+        return torch.stack([m[:, :3, 3] for m in matrices], 1)
+
+    def jacobian(self, q: torch.Tensor) -> torch.Tensor:
+        """Jacobians (N, A, 3, n) [m/rad] of the hand positions, for arm joints `q`, (N, A, n) or (N, A n) [rad].
+
+        Raises:
+            ValueError: `q` has another shape or is not finite.
+        """
+        arms = self._split(q)
+        return torch.stack([c.jacobian(arms[:, i])[:, :3] for i, c in enumerate(self._chains)], 1)
+
+    def _split(self, q: torch.Tensor) -> torch.Tensor:
+        arms, joints = len(self._chains), self.num_joints
+        if q.dim() == 2 and q.shape[1] == arms * joints:
+            q = q.unflatten(1, (arms, joints))
+        if q.dim() != 3 or tuple(q.shape[1:]) != (arms, joints):
+            raise ValueError(f"q must have shape (N, {arms}, {joints}) or (N, {arms * joints}), got {tuple(q.shape)}")
+        return require_all_finite("q", q).to(dtype=self.dtype, device=self.device)
+
+
+def _serial_chain(spec: RobotSpec, arm: ArmSpec) -> Any:
+    """From the torso link to the hand point. Joint angles are counted in the order of the chain."""
+    import pytorch_kinematics as pk  # loads mujoco and matplotlib; whoever imports cotap.compliance needs neither
+
+    axes = {j.name: j.axis for j in spec.joints}
+
+    def offset(position: tuple[float, ...], quat: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)) -> Any:
+        return pk.Transform3d(rot=list(quat), pos=list(position), dtype=torch.float64)
+
+    def frame(name: str, joint: Any) -> Any:
+        return pk.frame.Frame(name, pk.frame.Link(name, offset((0.0, 0.0, 0.0))), joint)
+
+    nowhere = offset((0.0, 0.0, 0.0))
+    root = parent = frame(spec.torso_body, pk.frame.Joint(offset=nowhere, dtype=torch.float64))
+    for body in spec.chain(arm.hand_body, spec.torso_body):
+        name = body.joint or ""
+        joint = pk.frame.Joint(name, offset(body.pos, body.quat), "revolute", axes[name], dtype=torch.float64)
+        child = frame(body.name, joint)
+        parent.add_child(child)
+        parent = child
+    tip = pk.frame.Joint(f"{arm.side}_hand_point", offset(arm.hand_point), "fixed", dtype=torch.float64)
+    parent.add_child(frame(f"{arm.side}_hand", tip))
+    return pk.SerialChain(pk.Chain(root, dtype=torch.float64), f"{arm.side}_hand")

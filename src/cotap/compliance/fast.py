@@ -1,0 +1,146 @@
+"""Blended stiffness of many arms at once, in closed form: what rollouts use in place of `modulate_stiffness`.
+
+For a PD law whose gain is one number k on all joints of an arm, the log-Euclidean blend is a matrix power,
+`K = k^(1-a) K_u^a`. With `G = B B^T`, `B^T B = J^T C_hat^-1 J`, and the projector N on the null space,
+
+    K = k^(1-a) (B^T G^(a-1) B + k_null^a N),
+
+and the power of the m x m matrix G is a Newton polynomial through its eigenvalues, which have a closed form for m = 3.
+All in float64: the polynomial's terms cancel, and one double costs less than one eigendecomposition.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from cotap.compliance.stiffness import RANK_TOLERANCE
+
+_EYE = torch.eye(3, dtype=torch.float64)
+
+
+@dataclass(frozen=True)
+class ArmStiffness:
+    """What one control step of compliance needs, for arms (..., n joints) with a 3-D task."""
+
+    stiffness: torch.Tensor
+    """(..., n, n) the blend K [Nm/rad]."""
+    pseudo_inverse: torch.Tensor
+    """(..., n, 3) J#, damped near rank loss."""
+    null_projector: torch.Tensor
+    """(..., n, n) I - J# J."""
+    ratio: torch.Tensor
+    """(...) alpha after the singularity."""
+    singularity: torch.Tensor
+    """(...) 1 / (1 + max(0, cond(J) - threshold))."""
+    eigenvalue_range: torch.Tensor
+    """(..., 2) smallest and largest eigenvalue of K [Nm/rad]."""
+
+
+def eigenvalues_3x3(a: torch.Tensor) -> torch.Tensor:
+    """Eigenvalues (..., 3), ascending, of symmetric positive semidefinite matrices (..., 3, 3)."""
+    diagonal = torch.diagonal(a, dim1=-2, dim2=-1)
+    off = a[..., 0, 1].square() + a[..., 0, 2].square() + a[..., 1, 2].square()
+    mean = diagonal.mean(-1)
+    spread = (((diagonal - mean.unsqueeze(-1)).square().sum(-1) + 2.0 * off) / 6.0).sqrt()
+    tiny = torch.finfo(a.dtype).tiny
+    b = (a - mean[..., None, None] * _EYE.to(a)) / spread.clamp_min(tiny)[..., None, None]
+    angle = torch.acos((0.5 * determinant_3x3(b)).clamp(-1.0, 1.0)) / 3.0
+    largest = mean + 2.0 * spread * angle.cos()
+    smallest = mean + 2.0 * spread * (angle + 2.0 * torch.pi / 3.0).cos()
+    middle = 3.0 * mean - largest - smallest
+    return torch.stack((smallest, middle, largest), -1)
+
+
+def determinant_3x3(a: torch.Tensor) -> torch.Tensor:
+    """Determinants (...) of (..., 3, 3)."""
+    return (a[..., 0, :] * torch.linalg.cross(a[..., 1, :], a[..., 2, :])).sum(-1)
+
+
+def inverse_3x3(a: torch.Tensor) -> torch.Tensor:
+    """Inverses (..., 3, 3) of (..., 3, 3)."""
+    rows = a.unbind(-2)
+    columns = torch.stack([torch.linalg.cross(rows[i - 2], rows[i - 1]) for i in range(3)], -1)
+    return columns / (rows[0] * columns[..., 0]).sum(-1)[..., None, None]
+
+
+def blended_stiffness(
+    jacobian: torch.Tensor, task_stiffness: torch.Tensor, null_stiffness: torch.Tensor, pd_stiffness: torch.Tensor,
+    alpha: torch.Tensor, threshold: float = 10.0,
+) -> ArmStiffness:  # fmt: skip
+    """The singularity-aware blend of compliance and PD (paper, equations 7 to 10).
+
+    Agrees with `modulate_stiffness(resolve_joint_stiffness(...), pd, singularity_aware_ratio(...))` up to the damping
+    near rank loss. Arguments are taken to be valid.
+
+    Args:
+        jacobian: (..., 3, n) of the hands, in the frame in which stiffness is diagonal [m/rad].
+        task_stiffness: (..., 3) what the arm contributes, `C_hat^-1` as a diagonal, or (..., 3, 3) [N/m].
+        null_stiffness: (...) [Nm/rad].
+        pd_stiffness: (...) the PD law's gain, the same on all joints of an arm [Nm/rad].
+        alpha: (...) in [0, 1].
+        threshold: Condition number up to which alpha is kept.
+    """
+    j = jacobian.double()
+    gram = j @ j.transpose(-1, -2)
+    squares = eigenvalues_3x3(gram)
+    largest = squares[..., 2].clamp_min(1e-12)
+    condition = (largest / squares[..., 0].clamp_min(1e-14 * largest)).sqrt()
+    singularity = 1.0 / (1.0 + (condition - threshold).clamp_min(0.0))
+    ratio = alpha.double() * singularity
+    missing = (RANK_TOLERANCE**2 * largest - squares[..., 0]).clamp_min(0.0)
+    pseudo_inverse = j.transpose(-1, -2) @ inverse_3x3(gram + missing[..., None, None] * _EYE.to(j))
+    eye = torch.eye(j.shape[-1], dtype=j.dtype, device=j.device)
+    null_projector = eye - pseudo_inverse @ j
+    if task_stiffness.dim() == jacobian.dim():
+        b = torch.linalg.cholesky(task_stiffness.double()).transpose(-1, -2) @ j
+    else:
+        b = task_stiffness.double().sqrt().unsqueeze(-1) * j
+    inner = b @ b.transpose(-1, -2)
+    values = eigenvalues_3x3(inner)
+    # A direction that the arm can hardly move in is as stiff as the damped null space makes it.
+    floor = 1e-6 * values[..., 2:].clamp_min(1e-12)
+    values = values.maximum(floor)
+    null, pd = null_stiffness.double(), pd_stiffness.double()
+    scale = pd.pow(1.0 - ratio)
+    power = _power(inner, values, ratio - 1.0)
+    of_null = null.pow(ratio)
+    task = b.transpose(-1, -2) @ power @ b
+    stiffness = scale[..., None, None] * (task + of_null[..., None, None] * null_projector)
+    ends = values[..., [0, 2]].pow(ratio.unsqueeze(-1))
+    spectrum = torch.stack((torch.minimum(ends[..., 0], of_null), torch.maximum(ends[..., 1], of_null)), -1)
+    kind = jacobian.dtype
+    return ArmStiffness(
+        stiffness.to(kind), pseudo_inverse.to(kind), null_projector.to(kind), ratio.to(kind), singularity.to(kind),
+        (scale.unsqueeze(-1) * spectrum).to(kind),
+    )  # fmt: skip
+
+
+def _power(matrix: torch.Tensor, values: torch.Tensor, exponent: torch.Tensor) -> torch.Tensor:
+    """`matrix^exponent`, (..., 3, 3), by Newton's polynomial through its ascending eigenvalues (..., 3)."""
+    low, middle, high = values.unbind(-1)
+    f_low, f_middle, f_high = (v.pow(exponent) for v in (low, middle, high))
+    first = _divided(f_low, f_middle, low, middle, exponent)
+    second = _divided(f_middle, f_high, middle, high, exponent)
+    gap = high - low
+    close = gap <= 1e-4 * high
+    third = torch.where(
+        close,
+        0.5 * exponent * (exponent - 1.0) * middle.pow(exponent - 2.0),
+        (second - first) / torch.where(close, torch.ones_like(gap), gap),
+    )
+    eye = _EYE.to(matrix)
+    from_low, from_middle = matrix - low[..., None, None] * eye, matrix - middle[..., None, None] * eye
+    slope = first[..., None, None] * eye + third[..., None, None] * from_middle
+    return f_low[..., None, None] * eye + from_low @ slope
+
+
+def _divided(
+    f_a: torch.Tensor, f_b: torch.Tensor, a: torch.Tensor, b: torch.Tensor, exponent: torch.Tensor
+) -> torch.Tensor:
+    """First divided difference of `x^exponent` between `a` and `b`; the derivative where they are nearly equal."""
+    gap = b - a
+    close = gap <= 1e-6 * b
+    derivative = exponent * (0.5 * (a + b)).pow(exponent - 1.0)
+    return torch.where(close, derivative, (f_b - f_a) / torch.where(close, torch.ones_like(gap), gap))

@@ -1,0 +1,230 @@
+"""Upper-body laws: how arms answer to their targets and to forces. One interface, laws chosen by name.
+
+A law is asked once a control step and answers with a torque that is affine in the joints' state,
+`tau(q, dq) = feedforward + elastic - K (q - anchor) - D dq`, which then acts at the physics rate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import torch
+
+from cotap.checks import require_one_of, require_range
+from cotap.compliance.dynamics import LinkInertias, critical_damping, gravity_torque, joint_inertia
+from cotap.compliance.fast import ArmStiffness, blended_stiffness, inverse_3x3
+from cotap.compliance.kinematics import ChainPose, SerialChains
+from cotap.compliance.stiffness import project_compliance
+
+ERRORS = ("joint", "task")
+DAMPINGS = ("pd", "critical")
+
+
+@dataclass
+class LawConfig:
+    """One arm's law and its parameters as every world has them at first."""
+
+    name: str = "pd"
+    """pd, soft-pd or cotap."""
+    stiffness: tuple[float, float, float] = (300.0, 300.0, 300.0)
+    """Hand stiffness K_ee along x, y and z of the heading frame [N/m] (cotap)."""
+    null_stiffness: float = 40.0
+    """Stiffness k_null of arm motion that leaves the hand where it is [Nm/rad] (cotap)."""
+    alpha: float = 1.0
+    """Share of compliance in the blend with PD: 1 all compliance, 0 all PD, with gravity compensation (cotap)."""
+    error: str = "joint"
+    """joint: stiffness acts on joint errors (the paper). task: on the hand's, exact at any displacement (cotap)."""
+    damping: str = "pd"
+    """pd: the PD law's. critical: from stiffness and joint-space inertia (cotap)."""
+    soft_gain: float = 30.0
+    """Position gain [Nm/rad] (soft-pd)."""
+
+    def check(self, where: str = "law") -> None:
+        """Raise ValueError naming the first field, under `where`, that is out of its range."""
+        require_one_of(f"{where}.name", self.name, LAWS.keys())
+        require_one_of(f"{where}.error", self.error, ERRORS)
+        require_one_of(f"{where}.damping", self.damping, DAMPINGS)
+        for i, value in enumerate(self.stiffness):
+            require_range(f"{where}.stiffness[{i}]", value, 1.0, 1e5)
+        require_range(f"{where}.null_stiffness", self.null_stiffness, 0.1, 1e4)
+        require_range(f"{where}.alpha", self.alpha, 0.0, 1.0)
+        require_range(f"{where}.soft_gain", self.soft_gain, 0.1, 1e4)
+
+
+@dataclass
+class LawParameters:
+    """What may differ between worlds and change at any step. N worlds, A arms."""
+
+    stiffness: torch.Tensor
+    """(N, A, 3) hand stiffness along the axes of the heading frame [N/m]."""
+    null_stiffness: torch.Tensor
+    """(N, A) [Nm/rad]."""
+    alpha: torch.Tensor
+    """(N, A) in [0, 1]."""
+
+
+@dataclass(frozen=True)
+class Arms:
+    """What a law may know of the arms it drives: nominal gains, limits, masses, kinematics. A arms of n joints."""
+
+    chains: SerialChains
+    inertias: LinkInertias
+    kp: torch.Tensor
+    """(A, n) PD position gains [Nm/rad]."""
+    kd: torch.Tensor
+    """(A, n) PD damping gains [Nms/rad]."""
+
+
+@dataclass(frozen=True)
+class ArmState:
+    """What a law senses at the start of a control step."""
+
+    position: torch.Tensor
+    """(N, A, n) joint angles [rad]."""
+    velocity: torch.Tensor
+    """(N, A, n) [rad/s]."""
+    target: torch.Tensor
+    """(N, A, n) joint angles that are wanted [rad]."""
+    pose: ChainPose
+    """The arms in the torso frame."""
+    to_heading: torch.Tensor
+    """(N, 3, 3) from the torso to the heading frame."""
+    base_compliance_h: torch.Tensor | None = None
+    """(N, A, 3, 3) the hands' compliance through a moving torso, heading frame [m/N]; None counts as none."""
+
+
+@dataclass(frozen=True)
+class TorqueLaw:
+    """`tau(q, dq) = feedforward + elastic - K (q - anchor) - D dq`, for one control step."""
+
+    anchor: torch.Tensor
+    """(N, A, n) [rad]."""
+    feedforward: torch.Tensor
+    """(N, A, n) what does not depend on the target [Nm]."""
+    elastic: torch.Tensor
+    """(N, A, n) K times the error at the anchor [Nm]."""
+    stiffness: torch.Tensor
+    """(N, A, n, n) [Nm/rad]."""
+    damping: torch.Tensor
+    """(N, A, n, n) [Nms/rad]."""
+
+    def at(
+        self,
+        q: torch.Tensor,
+        dq: torch.Tensor,
+        kp_scale: torch.Tensor | float = 1.0,
+        kd_scale: torch.Tensor | float = 1.0,
+    ) -> torch.Tensor:
+        """Torques (N, A, n) [Nm] at joint angles and rates (N, A, n), gains off by these factors."""
+        elastic = self.elastic - (self.stiffness * (q - self.anchor).unsqueeze(-2)).sum(-1)
+        viscous = (self.damping * dq.unsqueeze(-2)).sum(-1)
+        return self.feedforward + kp_scale * elastic - kd_scale * viscous
+
+
+@dataclass
+class LawReport:
+    """What a law did in one step, for the log; (N, A) each. Laws that blend nothing leave it empty."""
+
+    values: dict[str, torch.Tensor] = field(default_factory=dict)
+
+
+class UpperBodyLaw(Protocol):
+    """How one kind of law is asked. To add one, write a class with this method and name it in `LAWS`."""
+
+    def __call__(self, state: ArmState, parameters: LawParameters) -> tuple[TorqueLaw, LawReport]:
+        """The torque law of this control step."""
+        ...
+
+
+class PDLaw:
+    """Joint PD control without gravity compensation, as on the robot itself.
+
+    Args:
+        arms: What is driven.
+        gain: One position gain for all joints [Nm/rad]; None for the robot's own.
+    """
+
+    def __init__(self, arms: Arms, gain: float | None = None) -> None:
+        kp = arms.kp if gain is None else torch.full_like(arms.kp, gain)
+        self._kp, self._stiffness, self._damping = kp, torch.diag_embed(kp), torch.diag_embed(arms.kd)
+
+    def __call__(self, state: ArmState, parameters: LawParameters) -> tuple[TorqueLaw, LawReport]:  # noqa: ARG002
+        """`kp (target - q) - kd dq`."""
+        n = state.position.shape[0]
+        elastic = self._kp * (state.target - state.position)
+        stiffness, damping = (m.expand(n, -1, -1, -1) for m in (self._stiffness, self._damping))
+        return TorqueLaw(state.position, torch.zeros_like(elastic), elastic, stiffness, damping), LawReport()
+
+
+class CoTaPLaw:
+    """Task-space compliance blended with PD on the manifold of stiffness matrices (paper, section III).
+
+    Args:
+        arms: What is driven; the PD law must have one gain on all joints of an arm.
+        cfg: Which error and which damping.
+
+    Raises:
+        ValueError: the PD gains of an arm differ between its joints.
+    """
+
+    def __init__(self, arms: Arms, cfg: LawConfig) -> None:
+        if not torch.equal(arms.kp, arms.kp[:, :1].expand_as(arms.kp)):
+            raise ValueError(f"cotap needs one position gain on all joints of an arm, got {arms.kp.tolist()}")
+        self._arms, self._cfg = arms, cfg
+        self._damping = torch.diag_embed(arms.kd)
+
+    def __call__(self, state: ArmState, parameters: LawParameters) -> tuple[TorqueLaw, LawReport]:
+        """Gravity plus `K` times the error, minus damping."""
+        n = state.position.shape[0]
+        jacobian_h = state.to_heading.unsqueeze(1) @ self._arms.chains.jacobian(state.pose)
+        felt, projected = _arm_stiffness(parameters.stiffness, state.base_compliance_h)
+        pd = self._arms.kp[:, 0].expand(n, -1)
+        blend = blended_stiffness(jacobian_h, felt, parameters.null_stiffness, pd, parameters.alpha)
+        error = state.target - state.position
+        if self._cfg.error == "task":
+            error = self._task_error(state, blend, error)
+        up_t = state.to_heading[:, 2]
+        gravity = gravity_torque(self._arms.inertias, state.pose, up_t)
+        elastic = (blend.stiffness * error.unsqueeze(-2)).sum(-1)
+        if self._cfg.damping == "critical":
+            damping = critical_damping(blend.stiffness, joint_inertia(self._arms.inertias, state.pose))
+        else:
+            damping = self._damping.expand(n, -1, -1, -1)
+        report = {
+            "alpha": blend.ratio, "projected": projected.float(), "smallest_eigenvalue": blend.eigenvalue_range[..., 0],
+            "largest_eigenvalue": blend.eigenvalue_range[..., 1],
+        }  # fmt: skip
+        return TorqueLaw(state.position, gravity, elastic, blend.stiffness, damping), LawReport(report)
+
+    def _task_error(self, state: ArmState, blend: ArmStiffness, joint_error: torch.Tensor) -> torch.Tensor:
+        """`J# (x_target - x) + N (q_target - q)`; back to the joint error where the blend goes back to PD."""
+        reach_t = self._arms.chains.pose(state.target).tip - state.pose.tip
+        reach_h = (state.to_heading.unsqueeze(1) @ reach_t.unsqueeze(-1)).squeeze(-1)
+        task = (blend.pseudo_inverse * reach_h.unsqueeze(-2)).sum(-1)
+        task = task + (blend.null_projector * joint_error.unsqueeze(-2)).sum(-1)
+        return torch.lerp(joint_error, task, blend.singularity.unsqueeze(-1))
+
+
+LEAST_COMPLIANCE = 1e-4
+"""What is left to an arm whose torso is more compliant than the hand is asked to be [m/N]: 10 kN/m."""
+
+
+def _arm_stiffness(
+    stiffness: torch.Tensor, base_compliance_h: torch.Tensor | None
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """What the arm contributes, diagonal (N, A, 3) or full (N, A, 3, 3), and where (N, A) it had to be bounded."""
+    if base_compliance_h is None:
+        return stiffness, torch.zeros_like(stiffness[..., 0], dtype=torch.bool)
+    compliance, projected = project_compliance(torch.diag_embed(1.0 / stiffness) - base_compliance_h, LEAST_COMPLIANCE)
+    inverse = inverse_3x3(compliance)
+    return 0.5 * (inverse + inverse.transpose(-1, -2)), projected
+
+
+LAWS: dict[str, Callable[[Arms, LawConfig], UpperBodyLaw]] = {
+    "pd": lambda arms, _: PDLaw(arms),
+    "soft-pd": lambda arms, cfg: PDLaw(arms, cfg.soft_gain),
+    "cotap": CoTaPLaw,
+}
+"""Every law, by name."""

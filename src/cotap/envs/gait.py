@@ -1,0 +1,102 @@
+"""The gait clock: which foot is where in its stride, and the stepping motion that it feeds forward to the legs."""
+
+from __future__ import annotations
+
+# MuJoCo's extension module has no type stubs.
+# pyright: reportAttributeAccessIssue=false
+import mujoco
+import numpy as np
+import torch
+
+from cotap.robots import RobotSpec
+
+STANCE_SHARE = 0.58
+"""Part of a stride that a foot spends on the ground."""
+
+
+def foot_phases(phase: torch.Tensor, num_feet: int) -> torch.Tensor:
+    """Each foot's own phase, (N, num_feet) in [0, 1), for the clock's (N,): foot i is i / num_feet ahead."""
+    shift = torch.arange(num_feet, dtype=phase.dtype) / num_feet
+    return (phase.unsqueeze(1) + shift).remainder(1.0)
+
+
+def desired_contact(phase: torch.Tensor, stand: torch.Tensor, num_feet: int) -> torch.Tensor:
+    """Which feet should be on the ground, (N, num_feet) bool."""
+    return (foot_phases(phase, num_feet) < STANCE_SHARE) | (stand.unsqueeze(1) > 0.5)
+
+
+def swing_progress(phase: torch.Tensor, num_feet: int) -> torch.Tensor:
+    """How far each foot is through its swing, (N, num_feet) in [0, 1]; 0 during stance."""
+    return ((foot_phases(phase, num_feet) - STANCE_SHARE) / (1.0 - STANCE_SHARE)).clamp(0.0, 1.0)
+
+
+def sweep(phase: torch.Tensor, num_feet: int) -> torch.Tensor:
+    """Where each foot is between the front (1) and the back (-1) of its stride, (N, num_feet).
+
+    It moves back at constant speed in stance, as the ground does, and swings forward smoothly.
+    """
+    progress = foot_phases(phase, num_feet)
+    stance = 1.0 - 2.0 * progress / STANCE_SHARE
+    swing = -torch.cos(torch.pi * (progress - STANCE_SHARE) / (1.0 - STANCE_SHARE))
+    return torch.where(progress < STANCE_SHARE, stance, swing)
+
+
+class StepMotion:
+    """Joint offsets of the legs that lift the swinging foot and sweep both feet under a body that moves as commanded.
+
+    The sweep is kinematics of the first order about the default pose: the least-squares solution that moves a sole
+    forward, sideways and in yaw, and keeps it level and at its height.
+
+    Args:
+        spec: The robot.
+        model: Its compiled model.
+        period_s: Duration of a stride [s].
+        lift: Factor on the lift of the swinging foot.
+        stride: Factor on the sweep.
+    """
+
+    def __init__(
+        self, spec: RobotSpec, model: mujoco.MjModel, period_s: float, lift: float = 1.0, stride: float = 1.0
+    ) -> None:
+        chains = [spec.chain(foot.body, spec.base_body) for foot in spec.feet]
+        names = [[b.joint or "" for b in chain] for chain in chains]
+        self.joints = torch.tensor([spec.indices(chain) for chain in names])
+        """(F, n) which joints are moved."""
+        self._lift = torch.zeros(self.joints.shape)
+        for i, foot in enumerate(spec.feet):
+            for joint, angle in foot.flexion:
+                self._lift[i, names[i].index(joint)] = lift * angle
+        maps, lateral = zip(*(_sole_kinematics(spec, model, i, names[i]) for i in range(len(spec.feet))), strict=True)
+        # Half of the way that the ground moves during a stance, per unit of velocity.
+        self._per_velocity = 0.5 * stride * STANCE_SHARE * period_s * torch.stack(maps)
+        self._lateral = torch.tensor(lateral)
+
+    def __call__(self, phase: torch.Tensor, velocity_h: torch.Tensor, yaw_rate: torch.Tensor) -> torch.Tensor:
+        """Offsets (N, F, n) [rad] for the clock's phase (N,), velocities (N, 2) and yaw rates (N,)."""
+        feet = self.joints.shape[0]
+        bump = torch.sin(torch.pi * swing_progress(phase, feet)).square()
+        # The ground under a foot at (0, y) moves at -(v + w x r): turning adds -w y forwards.
+        forward = velocity_h[:, :1] - yaw_rate.unsqueeze(1) * self._lateral
+        rates = torch.stack((forward, velocity_h[:, 1:].expand(-1, feet), yaw_rate.unsqueeze(1).expand(-1, feet)), 2)
+        stride = (self._per_velocity * rates.unsqueeze(2)).sum(3)
+        return bump.unsqueeze(2) * self._lift + sweep(phase, feet).unsqueeze(2) * stride
+
+
+def _sole_kinematics(
+    spec: RobotSpec, model: mujoco.MjModel, foot: int, joints: list[str]
+) -> tuple[torch.Tensor, float]:
+    """Joint rates (n, 3) per unit of the sole's forward, sideways and yaw rate, and where the sole is sideways [m]."""
+    data = mujoco.MjData(model)
+    data.qpos[3] = 1.0
+    data.qpos[7:] = [j.default_rad for j in spec.joints]
+    mujoco.mj_forward(model, data)
+    body = model.body(spec.feet[foot].body).id
+    point = data.xpos[body] + data.xmat[body].reshape(3, 3) @ spec.feet[foot].sole
+    position, rotation = np.zeros((3, model.nv)), np.zeros((3, model.nv))
+    mujoco.mj_jac(model, data, position, rotation, point, body)
+    columns = [model.joint(name).dofadr[0] for name in joints]
+    # Rolling is given up first: a leg of five joints cannot do all six.
+    weight = np.array([1.0, 1.0, 1.0, 1e-3, 1.0, 1.0])
+    jacobian = np.concatenate((position, rotation))[:, columns] * weight[:, None]
+    inverse = np.linalg.pinv(jacobian) * weight
+    return torch.tensor(inverse[:, [0, 1, 5]], dtype=torch.float32), float(point[1])

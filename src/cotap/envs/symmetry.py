@@ -1,0 +1,68 @@
+"""Left-right reflection of observations and actions, as signed permutations."""
+
+from __future__ import annotations
+
+import torch
+
+from cotap.envs.observations import Term
+from cotap.reflection import Reflection
+from cotap.robots import RobotSpec
+
+# Reflection in the x-z plane: vectors keep x and z, axial vectors (rotations) keep y.
+_VECTOR, _AXIAL = (1.0, -1.0, 1.0), (-1.0, 1.0, -1.0)
+_SIGNS: dict[str, tuple[float, ...]] = {
+    "torso_angular_velocity": _AXIAL,
+    "projected_gravity": _VECTOR,
+    "command_velocity": (1.0, -1.0),
+    "command_yaw_rate": (-1.0,),
+    "command_stand": (1.0,),
+    "command_height": (1.0,),
+    # Half a stride later; both are zero while standing.
+    "sin_phase": (-1.0,),
+    "cos_phase": (-1.0,),
+    "torso_orientation": (1.0, *_AXIAL),
+    "torso_linear_velocity": _VECTOR,
+}
+
+
+def _join(parts: list[Reflection]) -> Reflection:
+    index: list[torch.Tensor] = []
+    start = 0
+    for part in parts:
+        index.append(part.index + start)
+        start += part.index.numel()
+    return Reflection(torch.cat(index), torch.cat([p.sign for p in parts]))
+
+
+def joint_reflection(spec: RobotSpec, joints: tuple[str, ...]) -> Reflection:
+    """Reflection of a vector over `joints`, which must contain every joint's mirror image."""
+    by_name = {j.name: j for j in spec.joints}
+    return Reflection(
+        torch.tensor([joints.index(by_name[n].mirror_name) for n in joints]),
+        torch.tensor([by_name[n].mirror_sign for n in joints]),
+    )
+
+
+def _term_reflection(spec: RobotSpec, name: str, width: int) -> Reflection:
+    if width == len(spec.joints):
+        return joint_reflection(spec, spec.joint_names)
+    if name in ("reference_arm_position", "arm_torque"):
+        return joint_reflection(spec, spec.upper_joints)
+    return Reflection(torch.arange(width), torch.tensor(_SIGNS[name]))
+
+
+def actor_reflection(spec: RobotSpec, terms: tuple[Term, ...], history: int) -> Reflection:
+    """Of the actor's observation: `history` steps of every term, term by term."""
+    return _join([_term_reflection(spec, name, width) for name, width, _ in terms for _ in range(history)])
+
+
+def critic_reflection(spec: RobotSpec, terms: tuple[Term, ...]) -> Reflection:
+    """Of what only the critic sees. Hands change places."""
+    swap = {"left": "right", "right": "left"}
+    sides = [arm.side for arm in spec.arms]
+    body = [t for t in terms if not t[0].startswith("hand_force")]
+    parts = [_term_reflection(spec, name, width) for name, width, _ in body]
+    hands = Reflection(
+        torch.cat([3 * sides.index(swap[s]) + torch.arange(3) for s in sides]), torch.tensor(_VECTOR * len(sides))
+    )
+    return _join([*parts, hands])

@@ -1,0 +1,221 @@
+"""The arms' laws inside the environment: chosen by name per arm, parameters per world, torque at the physics rate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+
+from cotap.checks import require_one_of, require_range
+from cotap.compliance.laws import LAWS, Arms, ArmState, LawConfig, LawParameters, TorqueLaw
+from cotap.compliance.torso import chain_compliance, hand_base_compliance, torso_compliance
+from cotap.envs.persistence import Stateful
+from cotap.envs.state import RobotState
+from cotap.robots import RobotSpec
+from cotap.robots.chains import arm_chains, arm_gains, arm_inertias, chains_between
+
+TORSO_MODELS = ("none", "constant", "support")
+
+
+@dataclass
+class TorsoComplianceConfig:
+    """What of the hand's compliance is put down to the torso, and so not left to the arm."""
+
+    model: str = "none"
+    """none: stiffness is against the torso. constant: `stiffness` below. support: from the legs on the ground."""
+    stiffness: tuple[float, float, float, float, float, float] = (5e3, 5e3, 2e4, 500.0, 500.0, 300.0)
+    """The torso's stiffness against the ground, along [N/m] and about [Nm/rad] x, y and z of the heading frame."""
+
+    def check(self) -> None:
+        """Raise ValueError naming the first field that is out of its range."""
+        require_one_of("upper_body.torso.model", self.model, TORSO_MODELS)
+        for i, value in enumerate(self.stiffness):
+            require_range(f"upper_body.torso.stiffness[{i}]", value, 1.0, 1e9)
+
+
+@dataclass
+class UpperBodyConfig:
+    """Which law drives which arm."""
+
+    left: LawConfig = field(default_factory=LawConfig)
+    right: LawConfig = field(default_factory=LawConfig)
+    torso: TorsoComplianceConfig = field(default_factory=TorsoComplianceConfig)
+
+    def check(self) -> None:
+        """Raise ValueError naming the first field that is out of its range."""
+        self.left.check("upper_body.left")
+        self.right.check("upper_body.right")
+        self.torso.check()
+
+    def of(self, side: str) -> LawConfig:
+        """The law of the arm on `side`."""
+        return {"left": self.left, "right": self.right}[side]
+
+
+class UpperBody(Stateful):
+    """Asks each arm's law once a control step and gives its torque at every physics step.
+
+    `parameters` are per-world tensors that anyone may write to at any step. A command that is late (control delay) is
+    mixed with the one before it by the time that each holds, as with PD targets.
+    """
+
+    STATE = ("fresh", "_anchor", "_feedforward", "_elastic", "_stiffness", "_damping")
+
+    def __init__(self, cfg: UpperBodyConfig, spec: RobotSpec, num_envs: int) -> None:
+        cfg.check()
+        self._cfg, self._spec = cfg, spec
+        chains = arm_chains(spec)
+        arms = Arms(chains, arm_inertias(spec), *arm_gains(spec))
+        configs = [cfg.of(arm.side) for arm in spec.arms]
+        self.active = any(c.name != "pd" for c in configs)
+        """Whether any arm is under a law that plain PD actuators do not implement by themselves."""
+        self._laws = []
+        for kind in dict.fromkeys((c.name, c.error, c.damping, c.soft_gain) for c in configs):
+            chosen = [(c.name, c.error, c.damping, c.soft_gain) == kind for c in configs]
+            law = LAWS[kind[0]](arms, next(c for c, mine in zip(configs, chosen, strict=True) if mine))
+            self._laws.append((law, torch.tensor(chosen)))
+        n, a, j = num_envs, len(configs), len(spec.arms[0].joints)
+        self.parameters = LawParameters(
+            torch.tensor([c.stiffness for c in configs]).repeat(n, 1, 1),
+            torch.tensor([c.null_stiffness for c in configs]).repeat(n, 1),
+            torch.tensor([c.alpha for c in configs]).repeat(n, 1),
+        )
+        self._shape = (n, a, j)
+        self.fresh = torch.ones(n, dtype=torch.bool)
+        # Two torque laws, the one in force and the one before it: (2, N, A, n[, n]).
+        self._anchor, self._feedforward, self._elastic = (torch.zeros(2, n, a, j) for _ in range(3))
+        self._stiffness, self._damping = (torch.zeros(2, n, a, j, j) for _ in range(2))
+        self._torso = _TorsoModel(cfg.torso, spec)
+        self.log: dict[str, torch.Tensor] = {}
+        """Means over worlds and arms of what the laws report about the last step."""
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """The next command of the worlds in `mask` has none before it."""
+        self.fresh = self.fresh | mask
+
+    def send(self, state: RobotState, target: torch.Tensor) -> None:
+        """Ask the laws, for targets (N, U) sent at the start of a control step."""
+        q, dq, wanted = (
+            x.reshape(self._shape) for x in (self._upper(state.joint_pos), self._upper(state.joint_vel), target)
+        )
+        to_heading = state.heading_w.transpose(1, 2) @ state.torso_rotation_w
+        base = self._torso.hand_compliance(state, to_heading)
+        arms = ArmState(q, dq, wanted, state.arms, to_heading, base)
+        new, self.log = self._ask(arms)
+        tensors = (new.anchor, new.feedforward, new.elastic, new.stiffness, new.damping)
+        for name, value in zip(self.STATE[1:], tensors, strict=True):
+            held: torch.Tensor = getattr(self, name)
+            before = torch.where(self.fresh.reshape(-1, *[1] * (value.dim() - 1)), value, held[1])
+            setattr(self, name, torch.stack((before, value)))
+        self.fresh = torch.zeros_like(self.fresh)
+
+    def torque(
+        self, q: torch.Tensor, dq: torch.Tensor, arrived: torch.Tensor, kp_scale: torch.Tensor, kd_scale: torch.Tensor
+    ) -> torch.Tensor:
+        """Arm torques (N, U) [Nm], limits aside.
+
+        Args:
+            q: (N, U) arm joint angles now [rad].
+            dq: (N, U) [rad/s].
+            arrived: (N,) share of the present physics step in which the newest command holds.
+            kp_scale: (N, U) factors on the joints' elastic torque.
+            kd_scale: (N, U) factors on the joints' damping.
+        """
+        state = [x.reshape(self._shape) for x in (q, dq, kp_scale, kd_scale)]
+        new = self._law(1).at(*state)
+        if not (arrived < 1.0).any():
+            return new.flatten(1)
+        return torch.lerp(self._law(0).at(*state), new, arrived[:, None, None]).flatten(1)
+
+    def implicit_gains(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Diagonals (N, U) of stiffness and damping in force, which the simulator may integrate implicitly."""
+        diagonals = (torch.diagonal(m[1], dim1=-2, dim2=-1).flatten(1) for m in (self._stiffness, self._damping))
+        stiffness, damping = diagonals
+        return stiffness, damping
+
+    def state_dict(self) -> dict[str, Any]:
+        """Its own state and the laws' parameters."""
+        p = self.parameters
+        own = {"stiffness": p.stiffness.clone(), "null_stiffness": p.null_stiffness.clone(), "alpha": p.alpha.clone()}
+        return super().state_dict() | {"parameters": own}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take over what `state_dict` returned. Raises ValueError for another size or a missing name."""
+        own = dict(state)
+        self.parameters = LawParameters(**{k: v.clone() for k, v in own.pop("parameters").items()})
+        super().load_state_dict(own)
+
+    def _upper(self, joints: torch.Tensor) -> torch.Tensor:
+        return joints[:, len(self._spec.lower_joints) :]
+
+    def _law(self, which: int) -> TorqueLaw:
+        return TorqueLaw(
+            self._anchor[which],
+            self._feedforward[which],
+            self._elastic[which],
+            self._stiffness[which],
+            self._damping[which],
+        )
+
+    def _ask(self, arms: ArmState) -> tuple[TorqueLaw, dict[str, torch.Tensor]]:
+        """Every law for all arms; each arm keeps its own's answer."""
+        merged: TorqueLaw | None = None
+        log: dict[str, torch.Tensor] = {}
+        for law, mine in self._laws:
+            answer, report = law(arms, self.parameters)
+            log.update({f"/law/{k}": v[:, mine].mean() for k, v in report.values.items()})
+            merged = answer if merged is None else _choose(mine, answer, merged)
+        assert merged is not None
+        return merged, log
+
+
+def _choose(mine: torch.Tensor, answer: TorqueLaw, other: TorqueLaw) -> TorqueLaw:
+    """`answer` for the arms in `mine` (A,), `other` for the rest."""
+    vector, matrix = mine[None, :, None], mine[None, :, None, None]
+    return TorqueLaw(
+        answer.anchor,
+        torch.where(vector, answer.feedforward, other.feedforward),
+        torch.where(vector, answer.elastic, other.elastic),
+        torch.where(matrix, answer.stiffness, other.stiffness),
+        torch.where(matrix, answer.damping, other.damping),
+    )
+
+
+class _TorsoModel:
+    """The hands' compliance through the torso, in the heading frame."""
+
+    def __init__(self, cfg: TorsoComplianceConfig, spec: RobotSpec) -> None:
+        self._cfg = cfg
+        gains = {j.name: j.kp for j in spec.joints}
+        self._constant = torch.diag(1.0 / torch.tensor(cfg.stiffness))
+        chains = [spec.chain(foot.body, spec.base_body) for foot in spec.feet]
+        names = [[b.joint or "" for b in chain] for chain in chains]
+        self._legs = chains_between(spec, spec.base_body, [(f.body, f.sole) for f in spec.feet])
+        self._leg_joints = torch.tensor([spec.indices(chain) for chain in names])
+        self._leg_gains = torch.tensor([[gains[n] for n in chain] for chain in names])
+        waist = [b.joint or "" for b in spec.chain(spec.torso_body, spec.base_body)]
+        self._waist = chains_between(spec, spec.base_body, [(spec.torso_body, (0.0, 0.0, 0.0))])
+        self._waist_joints = torch.tensor([spec.indices(waist)])
+        self._waist_gains = torch.tensor([[gains[n] for n in waist]])
+
+    def hand_compliance(self, s: RobotState, to_heading: torch.Tensor) -> torch.Tensor | None:
+        """(N, A, 3, 3) [m/N], or None where stiffness is against the torso."""
+        if self._cfg.model == "none":
+            return None
+        lever_h = s.arms.tip @ to_heading.transpose(1, 2)
+        if self._cfg.model == "constant":
+            return hand_base_compliance(self._constant.expand(lever_h.shape[0], 6, 6), lever_h)
+        return hand_base_compliance(self._support(s), lever_h)
+
+    def _support(self, s: RobotState) -> torch.Tensor:
+        base_to_heading = (s.heading_w.transpose(1, 2) @ s.base_rotation_w).unsqueeze(1)
+        legs = self._legs.pose(s.joint_pos[:, self._leg_joints])
+        waist = self._waist.pose(s.joint_pos[:, self._waist_joints])
+        torso = waist.tip
+        spring = []
+        for pose, gains in ((legs, self._leg_gains), (waist, self._waist_gains)):
+            axes = pose.axes @ base_to_heading.transpose(-1, -2)
+            anchors = (pose.anchors - torso.unsqueeze(2)) @ base_to_heading.transpose(-1, -2)
+            spring.append(chain_compliance(axes, anchors, gains, torch.zeros_like(anchors[:, :, 0])))
+        return torso_compliance(spring[0], spring[1][:, 0], s.foot_contact)

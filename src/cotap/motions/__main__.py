@@ -1,0 +1,73 @@
+"""`python -m cotap.motions import|show`: motion data in, and to look at."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from cotap.motions.formats import FORMATS
+from cotap.motions.importer import import_motions, table
+from cotap.motions.library import MotionError, MotionLibrary, shipped_library
+from cotap.robots import ROBOTS
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m cotap.motions", description=__doc__)
+    commands = parser.add_subparsers(dest="command", required=True)
+    importer = commands.add_parser("import", help="read motion files of any known format into one library")
+    importer.add_argument("sources", nargs="+", type=Path, metavar="SOURCE", help="files, or folders to search")
+    importer.add_argument("--format", default="auto", choices=("auto", *FORMATS))
+    importer.add_argument("--output", type=Path, required=True, metavar="FILE", help="the library to write (.npz)")
+    importer.add_argument("--mirror", action="store_true", help="add the left-right mirror image of every clip")
+    importer.add_argument("--source", default="not stated", help="where the motion comes from, kept in the file")
+    importer.add_argument("--licence", default="not stated", help="its terms, kept in the file")
+    shower = commands.add_parser("show", help="list a library's clips and plot them")
+    shower.add_argument("file", nargs="?", type=Path, metavar="FILE", help="a library; by default the shipped one")
+    shower.add_argument("--clip", action="append", default=[], help="only this clip (may be repeated)")
+    shower.add_argument("--output", type=Path, default=Path("runs/motions"), metavar="DIR", help="where pictures go")
+    for command in (importer, shower):
+        command.add_argument("--robot", default="h1", choices=tuple(ROBOTS))
+    return parser
+
+
+def _import(options: argparse.Namespace) -> int:
+    if options.output.suffix != ".npz":
+        raise MotionError(f"--output must end in .npz, got {str(options.output)!r}")
+    spec = ROBOTS[options.robot]()
+    result = import_motions(
+        options.sources, spec, options.format, options.mirror, options.source, options.licence, sys.stderr.isatty()
+    )
+    print(table(result))
+    if not result.clips:
+        raise MotionError("no clip could be used; nothing was written")
+    options.output.parent.mkdir(parents=True, exist_ok=True)
+    MotionLibrary(result.clips, spec).save(options.output)
+    print(f"\nwritten: {options.output}")
+    return 0
+
+
+def _show(options: argparse.Namespace) -> int:
+    from cotap.motions.show import show  # plotting loads slowly
+
+    spec = ROBOTS[options.robot]()
+    library = MotionLibrary.load(options.file, spec) if options.file else shipped_library(spec)
+    if options.clip:
+        library = library.select(options.clip, spec)
+    for path in show(library, spec, options.output):
+        print(f"written: {path}")
+    return 0
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Parse and run. Returns the exit status: 0, or 2 for what the user can correct."""
+    options = _parser().parse_args(arguments)
+    try:
+        return {"import": _import, "show": _show}[options.command](options)
+    except (MotionError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

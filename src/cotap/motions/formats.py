@@ -1,0 +1,241 @@
+"""Readers of public motion formats. Each names the clips of a file, and reads one when asked to.
+
+A reader returns `(name, read)` pairs, so that a clip that cannot be read takes no other with it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cotap.motions.joblib_files import load_joblib
+from cotap.motions.library import FPS, MotionClip, MotionError, MotionLibrary, read_npz
+from cotap.motions.processing import JointMotion
+from cotap.motions.retarget import HumanMotion, retarget
+from cotap.motions.rotations import Y_UP_TO_Z_UP, change_basis, from_axis_angle, from_wxyz, from_xyzw, heading
+from cotap.robots import RobotSpec
+
+Reader = Callable[[Path, RobotSpec], "list[tuple[str, Callable[[], JointMotion]]]"]
+
+_DEEPMIMIC_COLUMNS = 44
+_LAFAN_FPS = 30.0
+_LAFAN_ROOT = 7
+_AMASS_JOINTS = {"collar": {"left": 13, "right": 14}, "shoulder": {"left": 16, "right": 17},
+                 "elbow": {"left": 18, "right": 19}}  # fmt: skip
+# From SMPL's body axes (x left, y up, z forward) to x forward, y left, z up.
+_SMPL_TO_TORSO = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+
+
+def read_deepmimic(path: Path, spec: RobotSpec) -> list[tuple[str, Callable[[], JointMotion]]]:
+    """DeepMimic JSON: one clip a file; y up, quaternions scalar first, elbows as one angle."""
+    return [(path.stem, lambda: _from_human(spec, _deepmimic(path)))]
+
+
+def read_amass(path: Path, spec: RobotSpec) -> list[tuple[str, Callable[[], JointMotion]]]:
+    """AMASS npz: one clip a file; axis-angle of SMPL's joints, z up."""
+    return [(path.stem, lambda: _from_human(spec, _amass(path)))]
+
+
+def read_phc(path: Path, spec: RobotSpec) -> list[tuple[str, Callable[[], JointMotion]]]:
+    """PHC and human2humanoid joblib pickles: a dict of clips with `dof` of all joints; quaternions scalar last."""
+    content = load_joblib(path)
+    if not isinstance(content, dict) or not content:
+        raise MotionError(f"{str(path)!r} holds no dict of clips")
+    return [(str(name), lambda n=name, c=clip: _phc(str(n), c, spec)) for name, clip in content.items()]
+
+
+def read_lafan(path: Path, spec: RobotSpec) -> list[tuple[str, Callable[[], JointMotion]]]:
+    """LAFAN1 retargeting CSV: one clip a file, 30 Hz; root position, quaternion scalar last, all joints."""
+    return [(path.stem, lambda: _lafan(path, spec))]
+
+
+def read_library(path: Path, spec: RobotSpec) -> list[tuple[str, Callable[[], JointMotion]]]:
+    """Our own npz."""
+    library = MotionLibrary.load(path, spec)
+    return [(c.name, lambda c=c: _from_clip(c)) for c in library.clips]
+
+
+FORMATS: dict[str, Reader] = {
+    "deepmimic": read_deepmimic,
+    "amass": read_amass,
+    "phc": read_phc,
+    "lafan": read_lafan,
+    "npz": read_library,
+}
+SUFFIXES = (".txt", ".json", ".npz", ".pkl", ".joblib", ".csv")
+"""Files that are looked at in a folder."""
+
+
+def detect_format(path: Path) -> str:
+    """Which of `FORMATS` a file has, from its name and, for npz, its content. Raises MotionError if none."""
+    suffix = path.suffix.lower()
+    if suffix in (".txt", ".json"):
+        return "deepmimic"
+    if suffix in (".pkl", ".joblib"):
+        return "phc"
+    if suffix == ".csv":
+        return "lafan"
+    if suffix == ".npz":
+        keys = read_npz(path).keys()
+        if "poses" in keys:
+            return "amass"
+        if "arms" in keys:
+            return "npz"
+        raise MotionError(f"{str(path)!r} is neither AMASS (no 'poses') nor a motion library (no 'arms')")
+    raise MotionError(f"{str(path)!r} has no known suffix; known: {', '.join(SUFFIXES)}")
+
+
+def _from_clip(clip: MotionClip) -> JointMotion:
+    return JointMotion(clip.name, np.arange(len(clip.arms)) / FPS, clip.arms.astype(float), clip.root.astype(float))
+
+
+def _from_human(spec: RobotSpec, human: HumanMotion) -> JointMotion:
+    for side, rotation in human.upper_arms.items():
+        if not (np.isfinite(rotation).all() and np.isfinite(human.flexions[side]).all()):
+            raise MotionError(f"clip {human.name!r}: the {side} arm is not finite")
+    return JointMotion(human.name, human.times_s, retarget(spec, human), human.root, human)
+
+
+def _numbers(name: str, what: str, value: Any, columns: int | None = None, at_least: int = 0) -> np.ndarray:
+    """`value` as a finite (T, columns) array of floats, or a MotionError that names the clip."""
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise MotionError(f"clip {name!r}: {what} is no table of numbers ({error})") from error
+    wanted = f"(T, {columns})" if columns is not None else f"(T, at least {at_least})"
+    if array.ndim != 2 or array.shape[1] < at_least or (columns is not None and array.shape[1] != columns):
+        raise MotionError(f"clip {name!r}: {what} must have shape {wanted}, got {array.shape}")
+    if len(array) < 2:
+        raise MotionError(f"clip {name!r} has {len(array)} frames; at least 2 are needed")
+    if not np.isfinite(array).all():
+        raise MotionError(f"clip {name!r}: {what} is not finite at frame {np.argwhere(~np.isfinite(array))[0][0]}")
+    return array
+
+
+def _deepmimic(path: Path) -> HumanMotion:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+        raise MotionError(f"{str(path)!r} is not readable as JSON: {error}") from error
+    if not isinstance(content, dict) or "Frames" not in content:
+        raise MotionError(f"{str(path)!r} is no DeepMimic clip: it has no 'Frames'")
+    frames = _numbers(path.stem, "Frames", content["Frames"], _DEEPMIMIC_COLUMNS)
+    duration = frames[:-1, 0]
+    if (duration <= 0.0).any():
+        raise MotionError(f"clip {path.stem!r}: frame {int((duration <= 0.0).argmax())} has no positive duration")
+    root = change_basis(Y_UP_TO_Z_UP, _rotations(path.stem, from_wxyz, frames[:, 4:8]))
+    position = frames[:, 1:4] @ Y_UP_TO_Z_UP.T
+    shoulders = {"right": frames[:, 25:29], "left": frames[:, 39:43]}
+    return HumanMotion(
+        path.stem,
+        np.concatenate(([0.0], np.cumsum(duration))),
+        {s: change_basis(Y_UP_TO_Z_UP, _rotations(path.stem, from_wxyz, q)) for s, q in shoulders.items()},
+        {"right": frames[:, 29], "left": frames[:, 43]},
+        np.column_stack((position[:, :2], heading(root))),
+    )
+
+
+def _rotations(name: str, convert: Callable[[np.ndarray], np.ndarray], quaternions: np.ndarray) -> np.ndarray:
+    try:
+        return convert(quaternions)
+    except ValueError as error:  # a quaternion of zero length
+        raise MotionError(f"clip {name!r}: {error}") from error
+
+
+def _amass(path: Path) -> HumanMotion:
+    content = read_npz(path)
+    missing = {"poses", "trans"} - content.keys()
+    rate = content.get("mocap_framerate", content.get("mocap_frame_rate"))
+    if missing or rate is None:
+        raise MotionError(f"{str(path)!r} is no AMASS clip: it lacks {sorted(missing or {'mocap_framerate'})[0]!r}")
+    poses = _numbers(path.stem, "poses", content["poses"], at_least=66)
+    trans = _numbers(path.stem, "trans", content["trans"], 3)
+    fps = _rate(path.stem, rate)
+    if len(trans) != len(poses):
+        raise MotionError(f"clip {path.stem!r}: {len(poses)} poses but {len(trans)} root positions")
+
+    def rotation(joint: int) -> np.ndarray:
+        return from_axis_angle(poses[:, 3 * joint : 3 * joint + 3])
+
+    arms = {side: _smpl_arm(side, rotation) for side in ("left", "right")}
+    facing = rotation(0) @ _SMPL_TO_TORSO.T
+    return HumanMotion(
+        path.stem,
+        np.arange(len(poses)) / fps,
+        {side: arm[0] for side, arm in arms.items()},
+        {side: arm[1] for side, arm in arms.items()},
+        np.column_stack((trans[:, :2], heading(facing))),
+    )
+
+
+def _rate(name: str, value: Any) -> float:
+    try:
+        fps = float(value)
+    except (TypeError, ValueError) as error:
+        raise MotionError(f"clip {name!r}: frame rate {value!r} is no number") from error
+    if not 1.0 <= fps <= 10_000.0:
+        raise MotionError(f"clip {name!r}: frame rate must be in [1, 10000] Hz, got {fps}")
+    return fps
+
+
+def _smpl_arm(side: str, rotation: Callable[[int], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Upper arm rotation (T, 3, 3) and flexion (T,) from SMPL's, whose arms point sideways at rest.
+
+    SMPL's elbow is a ball. Its forearm's direction gives the flexion, and a turn of the upper arm about itself that
+    brings the forearm into the plane of a hinge; the turn fades out as the arm straightens, where it is undefined.
+    """
+    sideways = 1.0 if side == "left" else -1.0
+    hang = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -sideways], [0.0, sideways, 0.0]])  # from hanging to the T-pose
+    chest = rotation(_AMASS_JOINTS["collar"][side]) @ rotation(_AMASS_JOINTS["shoulder"][side])
+    upper = change_basis(_SMPL_TO_TORSO, chest) @ hang
+    elbow = hang.T @ change_basis(_SMPL_TO_TORSO, rotation(_AMASS_JOINTS["elbow"][side])) @ hang
+    forearm = -elbow[:, :, 2]
+    bent = np.hypot(forearm[:, 0], forearm[:, 1])
+    sign = np.where(forearm[:, 0] < 0.0, -1.0, 1.0)
+    turn = np.arctan2(sign * forearm[:, 1], np.abs(forearm[:, 0])) * np.minimum(1.0, np.square(bent / 0.15))
+    c, s, zero, one = np.cos(turn), np.sin(turn), np.zeros_like(turn), np.ones_like(turn)
+    about_z = np.stack((np.stack((c, -s, zero), 1), np.stack((s, c, zero), 1), np.stack((zero, zero, one), 1)), 1)
+    return upper @ about_z, np.arctan2(sign * bent, -forearm[:, 2])
+
+
+def _phc(name: str, clip: Any, spec: RobotSpec) -> JointMotion:
+    if not isinstance(clip, dict):
+        raise MotionError(f"clip {name!r} is no dict")
+    missing = {"dof", "root_trans_offset", "root_rot", "fps"} - clip.keys()
+    if missing:
+        raise MotionError(f"clip {name!r} lacks {sorted(missing)[0]!r}")
+    joints = _numbers(name, "dof", np.squeeze(np.asarray(clip["dof"])), len(spec.joints))
+    position = _numbers(name, "root_trans_offset", clip["root_trans_offset"], 3)
+    quaternion = _numbers(name, "root_rot", clip["root_rot"], 4)
+    return _joint_motion(name, _rate(name, clip["fps"]), position, quaternion, joints, spec)
+
+
+def _lafan(path: Path, spec: RobotSpec) -> JointMotion:
+    try:
+        rows = [
+            [float(value) for value in line.split(",")]
+            for line in path.read_text(encoding="utf-8").splitlines()
+            if line.strip()
+        ]
+    except (OSError, UnicodeDecodeError, ValueError) as error:
+        raise MotionError(f"{str(path)!r} is no table of numbers: {error}") from error
+    widths = {len(row) for row in rows}
+    wanted = _LAFAN_ROOT + len(spec.joints)
+    if widths - {wanted}:
+        raise MotionError(f"{str(path)!r} must have {wanted} columns in every line, got {sorted(widths)}")
+    table = _numbers(path.stem, "table", rows, wanted)
+    return _joint_motion(path.stem, _LAFAN_FPS, table[:, :3], table[:, 3:7], table[:, 7:], spec)
+
+
+def _joint_motion(
+    name: str, fps: float, position: np.ndarray, quaternion: np.ndarray, joints: np.ndarray, spec: RobotSpec
+) -> JointMotion:
+    if not len(position) == len(quaternion) == len(joints):
+        raise MotionError(f"clip {name!r}: {len(joints)} joint frames, but {len(position)} root positions")
+    facing = heading(_rotations(name, from_xyzw, quaternion))
+    upper = joints[:, spec.indices(spec.upper_joints)]
+    return JointMotion(name, np.arange(len(joints)) / fps, upper, np.column_stack((position[:, :2], facing)))

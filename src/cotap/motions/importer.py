@@ -1,0 +1,135 @@
+"""Importing files and folders of motion: what can be read is kept, what cannot is reported with the reason."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from cotap.motions.formats import FORMATS, SUFFIXES, detect_format
+from cotap.motions.library import MotionClip, MotionError
+from cotap.motions.processing import JointMotion, make_clip, mirror_clip
+from cotap.motions.quality import ClipQuality, assess
+from cotap.robots import RobotSpec
+
+
+@dataclass(frozen=True)
+class ImportResult:
+    """All that came of an import."""
+
+    clips: list[MotionClip]
+    quality: list[ClipQuality]
+    """One for each clip that was read; mirror images have none of their own."""
+    read: list[str]
+    """Names of the clips that were read."""
+    failures: list[tuple[str, str]]
+    """File or clip, and why it could not be used."""
+
+
+def find_files(sources: Iterable[Path]) -> list[Path]:
+    """The files themselves, and all of known suffix below the folders, sorted. Raises MotionError for a missing one."""
+    found: list[Path] = []
+    for source in sources:
+        if source.is_dir():
+            found += sorted(p for p in source.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
+        elif source.is_file():
+            found.append(source)
+        else:
+            raise MotionError(f"motion source {str(source)!r} does not exist")
+    if not found:
+        raise MotionError(f"no motion files there; suffixes looked for in folders: {', '.join(SUFFIXES)}")
+    return found
+
+
+def import_motions(
+    sources: Iterable[Path], spec: RobotSpec, file_format: str = "auto", mirror: bool = False,
+    source: str = "not stated", licence: str = "not stated", progress: bool = True,
+) -> ImportResult:  # fmt: skip
+    """Read, retarget and limit every clip of `sources`.
+
+    Args:
+        sources: Files and folders.
+        spec: The robot.
+        file_format: One of `FORMATS`, or auto.
+        mirror: Add the left-right mirror image of every clip.
+        source: Where the motion comes from, kept with each clip.
+        licence: Its terms, kept with each clip.
+        progress: Show a progress bar.
+
+    Raises:
+        MotionError: a source is missing, or there are no files.
+    """
+    result = ImportResult([], [], [], [])
+    taken: set[str] = set()
+    for path in tqdm(find_files(sources), desc="import", unit="file", disable=not progress, leave=False):
+        for label, outcome in _read_file(path, spec, file_format):
+            if isinstance(outcome, str):
+                result.failures.append((label, outcome))
+                continue
+            try:
+                clip, report = make_clip(spec, outcome, source, licence)
+                quality = assess(spec, outcome, clip, report)
+            except (MotionError, ValueError, np.linalg.LinAlgError) as error:
+                result.failures.append((label, str(error)))
+                continue
+            clip = _renamed(clip, taken)
+            result.clips.append(clip)
+            result.quality.append(quality)
+            result.read.append(clip.name)
+            if mirror:
+                result.clips.append(_renamed(mirror_clip(spec, clip), taken))
+    return result
+
+
+def _read_file(path: Path, spec: RobotSpec, file_format: str) -> Iterator[tuple[str, JointMotion | str]]:
+    """Every clip of a file, or in its place why it cannot be read."""
+    try:
+        reader = FORMATS[detect_format(path) if file_format == "auto" else file_format]
+        clips = reader(path, spec)
+    except (MotionError, OSError) as error:
+        yield str(path), str(error)
+        return
+    for name, read in clips:
+        label = str(path) if len(clips) == 1 else f"{path}:{name}"
+        try:
+            yield label, read()
+        except (MotionError, OSError, ValueError) as error:
+            yield label, str(error)
+
+
+def _renamed(clip: MotionClip, taken: set[str]) -> MotionClip:
+    """The clip under a name that no other has."""
+    name, number = clip.name, 2
+    while name in taken:
+        name, number = f"{clip.name}_{number}", number + 1
+    taken.add(name)
+    return (
+        clip if name == clip.name else MotionClip(name, clip.arms, clip.root, clip.source, clip.licence, clip.mirrored)
+    )
+
+
+def table(result: ImportResult) -> str:
+    """The clips that were read, their quality, and the failures, as Markdown."""
+    rows = [
+        "| clip | s | clipped | slowed | peak rad/s | hand path m | direction deg | elbow corr. | near singular |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for name, q in zip(result.read, result.quality, strict=True):
+        rows.append(
+            f"| {name} | {q.seconds:.1f} | {q.clipped_fraction:.1%} | {q.slowed_fraction:.1%} | "
+            f"{q.peak_speed_rad_s:.1f} | {q.hand_path_error_m:.3f} | {_or_dash(q.hand_direction_error_deg, '.1f')} | "
+            f"{_or_dash(q.elbow_correlation, '.3f')} | {q.singular_fraction:.1%} |"
+        )
+    minutes = sum(c.seconds for c in result.clips) / 60.0
+    out = [*rows, "", f"{len(result.clips)} clips ({len(result.read)} read), {minutes:.1f} minutes"]
+    if result.failures:
+        out += ["", f"{len(result.failures)} could not be used:"]
+        out += [f"- {label}: {reason}" for label, reason in result.failures]
+    return "\n".join(out)
+
+
+def _or_dash(value: float, form: str) -> str:
+    return "-" if np.isnan(value) else format(value, form)

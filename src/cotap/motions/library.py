@@ -1,0 +1,184 @@
+"""A library of motion clips: arm joints and root path at one frame rate, in one file that is validated on load."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import zipfile
+from dataclasses import dataclass
+from importlib.resources import as_file, files
+from pathlib import Path
+
+import numpy as np
+
+from cotap.robots import RobotSpec
+
+FPS = 50.0
+"""Frame rate of all libraries [Hz]."""
+_VERSION = 1
+
+
+class MotionError(ValueError):
+    """A motion file or clip that cannot be used; the message names it and says why."""
+
+
+@dataclass(frozen=True)
+class MotionClip:
+    """One clip at 50 Hz."""
+
+    name: str
+    arms: np.ndarray
+    """(T, U) arm joint angles in the order of the robot's upper joints [rad], float32."""
+    root: np.ndarray
+    """(T, 3) where the root is: x, y [m] and heading [rad], z up, float32."""
+    source: str
+    """Where it comes from."""
+    licence: str
+    """Under which terms."""
+    mirrored: bool = False
+    """Whether it is the left-right mirror image of what was recorded."""
+
+    @property
+    def seconds(self) -> float:
+        """Duration [s]."""
+        return (len(self.arms) - 1) / FPS
+
+
+def check_clip(clip: MotionClip, spec: RobotSpec) -> None:
+    """Raise MotionError if `clip` has wrong shapes, too few frames, values that are not finite or beyond limits."""
+    upper = [spec.joints[i] for i in spec.indices(spec.upper_joints)]
+    if clip.arms.ndim != 2 or clip.arms.shape[1] != len(upper):
+        raise MotionError(f"clip {clip.name!r}: arms must have shape (T, {len(upper)}), got {clip.arms.shape}")
+    if clip.root.shape != (len(clip.arms), 3):
+        raise MotionError(f"clip {clip.name!r}: root must have shape ({len(clip.arms)}, 3), got {clip.root.shape}")
+    if len(clip.arms) < 2:
+        raise MotionError(f"clip {clip.name!r} has {len(clip.arms)} frames; at least 2 are needed")
+    if not (np.isfinite(clip.arms).all() and np.isfinite(clip.root).all()):
+        raise MotionError(f"clip {clip.name!r} has values that are not finite")
+    low, high = np.array([j.range_rad for j in upper], dtype=np.float32).T
+    excess = np.maximum(low - clip.arms, clip.arms - high)
+    if excess.max() > 1e-5:
+        frame, joint = np.unravel_index(excess.argmax(), excess.shape)
+        raise MotionError(
+            f"clip {clip.name!r}: {upper[joint].name} is {clip.arms[frame, joint]:.3f} rad at frame {frame}; "
+            f"its limits are {upper[joint].range_rad}"
+        )
+
+
+class MotionLibrary:
+    """Clips of one robot's arms.
+
+    Raises:
+        MotionError: no clips, two of one name, or a clip that `check_clip` refuses.
+    """
+
+    def __init__(self, clips: list[MotionClip], spec: RobotSpec) -> None:
+        if not clips:
+            raise MotionError("a motion library needs at least one clip, got none")
+        for clip in clips:
+            check_clip(clip, spec)
+        names = [c.name for c in clips]
+        seen: set[str] = set()
+        for name in names:
+            if name in seen:
+                raise MotionError(f"two clips are called {name!r}")
+            seen.add(name)
+        self.clips, self.robot, self.joints = clips, spec.name, spec.upper_joints
+
+    def names(self) -> list[str]:
+        """Names of all clips, in order."""
+        return [c.name for c in self.clips]
+
+    def select(self, names: list[str], spec: RobotSpec) -> MotionLibrary:
+        """The clips of these names. Raises MotionError for an unknown one, listing those known."""
+        known = {c.name: c for c in self.clips}
+        for name in names:
+            if name not in known:
+                raise MotionError(f"no clip is called {name!r}; clips: {', '.join(sorted(known))}")
+        return MotionLibrary([known[n] for n in names], spec)
+
+    def save(self, path: str | Path) -> None:
+        """Write to `path` (.npz), by way of a temporary file."""
+        path = Path(path)
+        lengths = [len(c.arms) for c in self.clips]
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                np.savez_compressed(
+                    file, version=_VERSION, fps=FPS, robot=self.robot, joints=np.array(self.joints),
+                    names=np.array(self.names()), lengths=np.array(lengths),
+                    sources=np.array([c.source for c in self.clips]),
+                    licences=np.array([c.licence for c in self.clips]),
+                    mirrored=np.array([c.mirrored for c in self.clips]),
+                    arms=np.concatenate([c.arms for c in self.clips]).astype(np.float32),
+                    root=np.concatenate([c.root for c in self.clips]).astype(np.float32),
+                )  # fmt: skip
+            os.replace(temporary, path)
+        except BaseException:
+            Path(temporary).unlink(missing_ok=True)
+            raise
+
+    @classmethod
+    def load(cls, path: str | Path, spec: RobotSpec) -> MotionLibrary:
+        """Read a library; nothing in the file is run.
+
+        Raises:
+            MotionError: the file is missing, damaged, of another kind or for another robot.
+        """
+        content = read_npz(path)
+        missing = {"version", "fps", "robot", "joints", "names", "lengths", "sources", "licences", "mirrored", "arms",
+                   "root"} - content.keys()  # fmt: skip
+        if missing:
+            raise MotionError(f"{str(path)!r} is no motion library: it lacks {sorted(missing)[0]!r}")
+        if tuple(content["joints"].tolist()) != spec.upper_joints or str(content["robot"]) != spec.name:
+            raise MotionError(
+                f"{str(path)!r} is for the arms of {str(content['robot'])!r} "
+                f"({', '.join(content['joints'].tolist())}), not of {spec.name!r} ({', '.join(spec.upper_joints)})"
+            )
+        if float(content["fps"]) != FPS or int(content["version"]) != _VERSION:
+            raise MotionError(
+                f"{str(path)!r} has version {content['version']} at {content['fps']} Hz; "
+                f"this release reads version {_VERSION} at {FPS:g} Hz"
+            )
+        lengths = content["lengths"]
+        count = len(content["names"])
+        for key in ("lengths", "sources", "licences", "mirrored"):
+            if content[key].shape != (count,):
+                raise MotionError(f"{str(path)!r}: {key} has {content[key].shape} entries for {count} clips")
+        if lengths.size == 0 or lengths.min() < 1 or lengths.sum() != len(content["arms"]):
+            raise MotionError(f"{str(path)!r}: clip lengths do not add up to its {len(content['arms'])} frames")
+        stops = np.cumsum(lengths)
+        clips = [
+            MotionClip(
+                str(content["names"][i]), content["arms"][stop - n : stop], content["root"][stop - n : stop],
+                str(content["sources"][i]), str(content["licences"][i]), bool(content["mirrored"][i]),
+            )
+            for i, (n, stop) in enumerate(zip(lengths.tolist(), stops.tolist(), strict=True))
+        ]  # fmt: skip
+        return cls(clips, spec)
+
+
+def read_npz(path: str | Path) -> dict[str, np.ndarray]:
+    """All arrays of an npz file, none of them objects. Raises MotionError for anything else."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            if not isinstance(file, np.lib.npyio.NpzFile):
+                raise MotionError(f"{str(path)!r} is not an npz file")
+            return {key: file[key] for key in file.files}
+    except FileNotFoundError as error:
+        raise MotionError(f"motion file {str(path)!r} does not exist") from error
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, KeyError) as error:
+        if isinstance(error, MotionError):
+            raise
+        raise MotionError(f"{str(path)!r} is damaged or no npz file of plain numbers: {error}") from error
+
+
+def shipped_library(spec: RobotSpec) -> MotionLibrary:
+    """The library that comes with the package. Raises MotionError if there is none for this robot."""
+    resource = files("cotap.motions").joinpath(f"{spec.name}_motions.npz")
+    if not resource.is_file():
+        raise MotionError(
+            f"no motion library is shipped for robot {spec.name!r}; import one with python -m cotap.motions"
+        )
+    with as_file(resource) as path:
+        return MotionLibrary.load(path, spec)

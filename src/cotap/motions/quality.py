@@ -1,0 +1,93 @@
+"""How well a clip does what its source did, and what it asks of the robot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from cotap.motions.library import FPS, MotionClip
+from cotap.motions.processing import ClipReport, JointMotion, resample
+from cotap.motions.retarget import arm_direction
+from cotap.robots import RobotSpec
+from cotap.robots.chains import arm_chains
+
+SINGULAR = 10.0
+"""Condition number of a hand's Jacobian beyond which an arm counts as near a singularity."""
+
+
+@dataclass(frozen=True)
+class ClipQuality:
+    """One row of the importer's table. What a source does not allow to be measured is NaN."""
+
+    seconds: float
+    clipped_fraction: float
+    slowed_fraction: float
+    peak_speed_rad_s: float
+    hand_path_error_m: float
+    """Mean distance of the hands from where the source, scaled to the robot's arms, has them, shoulders together."""
+    hand_direction_error_deg: float
+    """Mean angle between the directions from shoulder to hand; NaN where the source stores joints."""
+    elbow_correlation: float
+    """Smallest correlation over both arms of elbow flexion with the source's; NaN where the source stores joints."""
+    singular_fraction: float
+
+
+def forward_kinematics(spec: RobotSpec, arms: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Shoulders, elbows and hands (T, A, 3) in the torso frame, and hand Jacobians (T, A, 3, n), for joints (T, U).
+
+    The shoulder is where the upper arm's axis begins.
+    """
+    chains = arm_chains(spec)
+    q = torch.as_tensor(arms, dtype=torch.float32).unflatten(1, (len(spec.arms), -1))
+    pose = chains.pose(q)
+    return (
+        pose.anchors[:, :, 1].double().numpy(), pose.anchors[:, :, -1].double().numpy(), pose.tip.double().numpy(),
+        chains.jacobian(pose).double().numpy(),
+    )  # fmt: skip
+
+
+def assess(spec: RobotSpec, motion: JointMotion, clip: MotionClip, report: ClipReport) -> ClipQuality:
+    """Compare a finished clip with what it was made from."""
+    shoulder, elbow, hand, jacobian = forward_kinematics(spec, clip.arms)
+    condition = np.linalg.cond(jacobian)
+    speed = np.abs(np.diff(clip.arms, axis=0)).max() * FPS
+    if motion.human is None:
+        wanted = forward_kinematics(spec, resample(motion.times_s, motion.arms))[2]
+        path, direction, correlation = float(np.linalg.norm(hand - wanted, axis=2).mean()), np.nan, np.nan
+    else:
+        path, direction, correlation = _against_human(spec, motion, shoulder, elbow, hand)
+    return ClipQuality(
+        clip.seconds, report.clipped_fraction, report.slowed_fraction, float(speed), path, direction, correlation,
+        float((condition > SINGULAR).any(1).mean()),
+    )  # fmt: skip
+
+
+def _against_human(
+    spec: RobotSpec, motion: JointMotion, shoulder: np.ndarray, elbow: np.ndarray, hand: np.ndarray
+) -> tuple[float, float, float]:
+    human = motion.human
+    assert human is not None
+    paths, angles, correlations = [], [], []
+    for i, arm in enumerate(spec.arms):
+        upper, fore = elbow[:, i] - shoulder[:, i], hand[:, i] - elbow[:, i]
+        ratio = float(np.linalg.norm(fore, axis=1).mean() / np.linalg.norm(upper, axis=1).mean())
+        # The reference directions at the source's own frames, then at the clip's.
+        reference = arm_direction(human.upper_arms[arm.side], human.flexions[arm.side], ratio)
+        flexion = resample(human.times_s, human.flexions[arm.side][:, None])[:, 0]
+        reference = resample(human.times_s, reference)
+        reference /= np.linalg.norm(reference, axis=1, keepdims=True)
+        reach = hand[:, i] - shoulder[:, i]
+        length = np.linalg.norm(reach, axis=1)
+        cosine = (reach * reference).sum(1) / length
+        angles.append(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))).mean())
+        upper_length = np.linalg.norm(upper, axis=1).mean()
+        human_length = upper_length * np.sqrt(1.0 + ratio**2 + 2.0 * ratio * np.cos(flexion))
+        paths.append(np.linalg.norm(reach - reference * human_length[:, None], axis=1).mean())
+        bend = np.arccos(
+            np.clip((upper * fore).sum(1) / np.linalg.norm(upper, axis=1) / np.linalg.norm(fore, axis=1), -1.0, 1.0)
+        )
+        still = flexion.std() < 1e-6 or bend.std() < 1e-6
+        correlations.append(np.nan if still else np.corrcoef(bend, flexion)[0, 1])
+    return float(np.mean(paths)), float(np.mean(angles)), float(np.min(correlations))

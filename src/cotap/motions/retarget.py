@@ -1,0 +1,130 @@
+"""From human arms to robot arms, in closed form.
+
+A human arm is its upper arm's rotation relative to the chest and its elbow's flexion. In the torso frame used here x
+points forward, y to the left, z up; with the identity rotation the upper arm hangs down, and flexion lifts the forearm
+forward. A robot arm whose shoulder is pitch, roll, yaw and whose elbow bends about the same axis as the pitch follows
+both exactly, up to its joint limits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cotap.robots import ArmSpec, RobotSpec
+
+
+@dataclass(frozen=True)
+class HumanMotion:
+    """A human's arms and root over time, in a z-up world; times start at 0 and grow."""
+
+    name: str
+    times_s: np.ndarray
+    """(T,) [s]."""
+    upper_arms: dict[str, np.ndarray]
+    """Per side, (T, 3, 3): the upper arm's rotation in the chest frame."""
+    flexions: dict[str, np.ndarray]
+    """Per side, (T,) elbow flexion, 0 for a straight arm [rad]."""
+    root: np.ndarray
+    """(T, 3) x, y [m] and heading [rad]."""
+
+
+@dataclass(frozen=True)
+class ArmFrames:
+    """What the closed form needs of one robot arm."""
+
+    tilt: float
+    """Rotation of the shoulder's pitch axis about x [rad]."""
+    low: np.ndarray
+    high: np.ndarray
+    """Joint limits [rad]."""
+
+
+def arm_frames(spec: RobotSpec, arm: ArmSpec) -> ArmFrames:
+    """Read an arm's shoulder from the robot. Raises ValueError for an arm of another kind."""
+    chain = spec.chain(arm.hand_body, spec.torso_body)
+    joints = [spec.joints[i] for i in spec.indices(arm.joints)]
+    axes = [j.axis for j in joints]
+    if axes != [(0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)]:
+        raise ValueError(f"{spec.name}: {arm.side} arm is not shoulder pitch, roll, yaw and elbow; its axes are {axes}")
+    tilt = 2.0 * np.arctan2(chain[0].quat[1], chain[0].quat[0])
+    low, high = np.array([j.range_rad for j in joints]).T
+    return ArmFrames(float(tilt), low, high)
+
+
+def elbow_angle(flexion: np.ndarray) -> np.ndarray:
+    """The robot's elbow angle: its forearm points forward at zero, so that a straight arm is a quarter turn."""
+    return 0.5 * np.pi - flexion
+
+
+def _about_x(angle: float) -> np.ndarray:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+
+
+def upper_arm_rotation(frames: ArmFrames, q: np.ndarray) -> np.ndarray:
+    """(T, 3, 3) upper arm in the chest frame for shoulder angles `q` (T, >= 3): what `shoulder_angles` inverts."""
+    (cp, cr, cy), (sp, sr, sy) = (f((q[:, :3] - [0.0, frames.tilt, 0.0]).T) for f in (np.cos, np.sin))
+    zero, one = np.zeros_like(cp), np.ones_like(cp)
+
+    def stack(*rows: list[np.ndarray]) -> np.ndarray:
+        return np.stack([np.stack(r, -1) for r in rows], -2)
+
+    pitch = stack([cp, zero, sp], [zero, one, zero], [-sp, zero, cp])
+    roll = stack([one, zero, zero], [zero, cr, -sr], [zero, sr, cr])
+    yaw = stack([cy, -sy, zero], [sy, cy, zero], [zero, zero, one])
+    return _about_x(frames.tilt) @ pitch @ roll @ yaw
+
+
+def shoulder_angles(frames: ArmFrames, rotation: np.ndarray) -> np.ndarray:
+    """Both solutions (2, T, 3) of pitch, roll and yaw for upper arm rotations (T, 3, 3), wrapped towards the limits.
+
+    The arm is Rx(tilt) Ry(pitch) Rx(roll - tilt) Rz(yaw). Where the upper arm lies along the pitch axis only the sum of
+    pitch and yaw is defined; what is returned there is one of many solutions.
+    """
+    m = _about_x(-frames.tilt) @ rotation
+    roll = np.arcsin(np.clip(-m[:, 1, 2], -1.0, 1.0))
+    pitch, yaw = np.arctan2(m[:, 0, 2], m[:, 2, 2]), np.arctan2(m[:, 1, 0], m[:, 1, 1])
+    first = np.stack((pitch, roll + frames.tilt, yaw), 1)
+    second = np.stack((pitch + np.pi, np.pi - roll + frames.tilt, yaw + np.pi), 1)
+    middle = 0.5 * (frames.low + frames.high)[:3]
+    return (np.stack((first, second)) - middle + np.pi) % (2.0 * np.pi) - np.pi + middle
+
+
+def choose_branch(frames: ArmFrames, solutions: np.ndarray) -> np.ndarray:
+    """The path (T, 3) through `solutions` (2, T, 3) that least exceeds limits and moves least (dynamic programming)."""
+    excess = np.maximum(frames.low[:3] - solutions, solutions - frames.high[:3]).clip(0.0).sum(2)
+    step = solutions[None, :, 1:] - solutions[:, None, :-1]  # (from, to, T - 1, 3)
+    move = np.square(np.linalg.norm(step, axis=-1))
+    cost = 100.0 * excess[:, 0]
+    came_from = np.zeros((2, solutions.shape[1]), dtype=np.int64)
+    for t in range(1, solutions.shape[1]):
+        # move[a, b] is from solution a's frame t - 1 to solution b's frame t.
+        total = cost[:, None] + move[:, :, t - 1]
+        came_from[:, t] = total.argmin(0)
+        cost = total.min(0) + 100.0 * excess[:, t]
+    branch = int(cost.argmin())
+    path = np.empty(solutions.shape[1], dtype=np.int64)
+    for t in range(solutions.shape[1] - 1, -1, -1):
+        path[t] = branch
+        branch = int(came_from[branch, t])
+    return np.take_along_axis(solutions, path[None, :, None], 0)[0]
+
+
+def retarget(spec: RobotSpec, motion: HumanMotion) -> np.ndarray:
+    """Arm joints (T, U) at the motion's own times, not yet limited [rad]."""
+    arms: list[np.ndarray] = []
+    for arm in spec.arms:
+        frames = arm_frames(spec, arm)
+        shoulder = choose_branch(frames, shoulder_angles(frames, motion.upper_arms[arm.side]))
+        arms.append(np.column_stack((shoulder, elbow_angle(motion.flexions[arm.side]))))
+    return np.concatenate(arms, 1)
+
+
+def arm_direction(rotation: np.ndarray, flexion: np.ndarray, forearm_ratio: float) -> np.ndarray:
+    """Unit vector (T, 3) from shoulder to hand of an arm whose forearm is `forearm_ratio` times its upper arm."""
+    zero = np.zeros_like(flexion)
+    local = np.stack((np.sin(flexion), zero, -np.cos(flexion)), 1) * forearm_ratio - [0.0, 0.0, 1.0]
+    hand = np.einsum("tij,tj->ti", rotation, local)
+    return hand / np.linalg.norm(hand, axis=1, keepdims=True)

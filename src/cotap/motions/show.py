@@ -1,0 +1,88 @@
+"""Pictures of a motion library: joints and hand paths of every clip, and the robot in a contact sheet."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from cotap.agents.checkpoint import write_atomically
+from cotap.evaluation.render import RenderingUnavailable, contact_sheet, render_frames
+from cotap.motions.library import FPS, MotionClip, MotionLibrary
+from cotap.motions.quality import forward_kinematics
+from cotap.robots import RobotSpec
+
+_FRAMES_PER_CLIP = 8
+_LARGEST_SHEET = 24
+"""Clips in a contact sheet; more are unreadable."""
+
+
+def describe(library: MotionLibrary) -> str:
+    """Name, duration, source and licence of every clip, as Markdown."""
+    rows = [f"| {c.name} | {c.seconds:.2f} | {c.source} | {c.licence} |" for c in library.clips]
+    return "\n".join(["| clip | s | source | licence |", "|---|---|---|---|", *rows])
+
+
+def show(library: MotionLibrary, spec: RobotSpec, folder: Path) -> Iterator[Path]:
+    """Print the list of clips, write a plot for each and a contact sheet of them; yields what was written.
+
+    Where the machine cannot render, it says so and leaves the sheet out.
+    """
+    print(describe(library))
+    folder.mkdir(parents=True, exist_ok=True)
+    for clip in library.clips:
+        path = folder / f"{clip.name.replace('/', '_')}.png"
+        plot_clip(path, clip, spec)
+        yield path
+    sheet = folder / "contact_sheet.png"
+    try:
+        _sheet(sheet, library.clips[:_LARGEST_SHEET], spec)
+    except RenderingUnavailable as error:
+        print(f"no contact sheet: {error}", file=sys.stderr)
+        return
+    yield sheet
+
+
+def plot_clip(path: Path, clip: MotionClip, spec: RobotSpec) -> None:
+    """Joint angles over time, arm by arm, and the hands' paths seen from the side and from the front."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    hands = forward_kinematics(spec, clip.arms)[2]
+    times = np.arange(len(clip.arms)) / FPS
+    arms = len(spec.arms)
+    figure, axes = plt.subplots(1, arms + 2, figsize=(4.0 * (arms + 2), 3.4), constrained_layout=True)
+    per_arm = len(spec.arms[0].joints)
+    for i, arm in enumerate(spec.arms):
+        for j, joint in enumerate(arm.joints):
+            axes[i].plot(times, clip.arms[:, i * per_arm + j], label=joint.removeprefix(f"{arm.side}_"))
+        axes[i].set(title=f"{arm.side} arm", xlabel="time [s]", ylabel="angle [rad]")
+        axes[i].legend(fontsize=7, frameon=False)
+    for axis, (column, label) in zip(axes[arms:], ((0, "forward"), (1, "leftward")), strict=True):
+        for i, arm in enumerate(spec.arms):
+            axis.plot(hands[:, i, column], hands[:, i, 2], label=arm.side)
+            axis.plot(hands[0, i, column], hands[0, i, 2], "k.", ms=5)
+        axis.set(title="hand paths in the torso frame", xlabel=f"{label} [m]", ylabel="up [m]", aspect="equal")
+        axis.legend(fontsize=7, frameon=False)
+    for axis in axes:
+        axis.grid(alpha=0.2)
+    figure.suptitle(f"{clip.name}, {clip.seconds:.2f} s")
+    write_atomically(path, lambda p: figure.savefig(p, dpi=110, format="png"))
+    plt.close(figure)
+
+
+def _sheet(path: Path, clips: list[MotionClip], spec: RobotSpec) -> None:
+    """One row per clip: the robot standing, its arms at evenly spaced moments."""
+    legs = torch.tensor([j.default_rad for j in spec.joints[: len(spec.lower_joints)]], dtype=torch.float64)
+    base = torch.tensor([0.0, 0.0, spec.nominal_height_m, 1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+    poses = [
+        torch.cat((base, legs, torch.as_tensor(clip.arms[i], dtype=torch.float64)))
+        for clip in clips
+        for i in np.linspace(0, len(clip.arms) - 1, _FRAMES_PER_CLIP).astype(int)
+    ]
+    contact_sheet(path, [f[::2, ::2] for f in render_frames(spec, torch.stack(poses))], _FRAMES_PER_CLIP)

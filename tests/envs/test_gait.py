@@ -1,0 +1,84 @@
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from cotap.envs.gait import StepMotion, desired_contact, sweep, swing_progress
+
+PERIOD, STANCE = 0.8, 0.58
+
+
+@pytest.mark.parametrize(
+    ("phase", "left", "right"),
+    [(0.0, True, True), (0.05, True, True), (0.1, True, False), (0.49, True, False), (0.55, True, True),
+     (0.6, False, True), (0.95, False, True)],
+)  # fmt: skip
+def test_desired_contact_alternates(phase, left, right):
+    assert desired_contact(torch.tensor([phase]), torch.zeros(1), 2).tolist() == [[left, right]]
+    assert desired_contact(torch.tensor([phase]), torch.ones(1), 2).tolist() == [[True, True]]
+
+
+def test_swing_progress_runs_from_lift_off_to_touch_down():
+    phase = torch.tensor([0.3, 0.58, 0.79, 0.999])
+    left = swing_progress(phase, 2)[:, 0]
+    torch.testing.assert_close(left, torch.tensor([0.0, 0.0, 0.5, 0.9976]), atol=1e-3, rtol=0)
+    torch.testing.assert_close(swing_progress(phase - 0.5, 2)[:, 1], left, atol=1e-5, rtol=0)
+
+
+def test_sweep_moves_back_with_the_ground_and_forward_smoothly():
+    phase = torch.linspace(0.0, 0.999, 1000)
+    left = sweep(phase, 2)[:, 0]
+    assert float(left[0]) == 1.0
+    assert float(left.min()) == pytest.approx(-1.0, abs=0.01)
+    assert float(left.diff().abs().max()) < 0.008  # no jump, the wrap-around below included
+    assert float(left[-1]) == pytest.approx(1.0, abs=0.01)
+    stance = left[: int(STANCE * 1000)]
+    torch.testing.assert_close(stance.diff(), torch.full((579,), -2.0 / STANCE / 999 * 0.999), atol=1e-5, rtol=0)
+    torch.testing.assert_close(sweep(phase - 0.5, 2)[:, 1], left, atol=1e-4, rtol=0)
+
+
+def sole(spec, model, joints, foot):
+    """Position and rotation of a foot's sole for joint angles, base at the origin."""
+    data = mujoco.MjData(model)
+    data.qpos[3], data.qpos[7:] = 1.0, joints
+    mujoco.mj_kinematics(model, data)
+    body = model.body(spec.feet[foot].body).id
+    rotation = data.xmat[body].reshape(3, 3)
+    return data.xpos[body] + rotation @ spec.feet[foot].sole, rotation
+
+
+@pytest.mark.parametrize("foot", [0, 1])
+@pytest.mark.parametrize(
+    ("velocity", "yaw_rate"), [((0.2, 0.0), 0.0), ((0.0, 0.1), 0.0), ((0.0, 0.0), 0.2), ((-0.2, 0.05), -0.2)]
+)
+def test_soles_move_under_the_body_as_the_ground_would(spec, model, velocity, yaw_rate, foot):
+    """Forward kinematics at touch-down against where the ground point of mid-stance was half a stance earlier."""
+    motion = StepMotion(spec, model, PERIOD)
+    touch_down = torch.tensor([0.5 * foot])
+    offsets = motion(touch_down, torch.tensor([velocity]), torch.tensor([yaw_rate]))[0]
+    joints = np.array([j.default_rad for j in spec.joints])
+    middle, _ = sole(spec, model, joints, foot)
+    joints[motion.joints[foot].numpy()] += offsets[foot].numpy()
+    position, rotation = sole(spec, model, joints, foot)
+    half_stance_s = 0.5 * STANCE * PERIOD
+    expected = middle + half_stance_s * np.array([velocity[0] - yaw_rate * middle[1], velocity[1], 0.0])
+    np.testing.assert_allclose(position, expected, atol=3e-3)
+    assert np.arctan2(rotation[1, 0], rotation[0, 0]) == pytest.approx(half_stance_s * yaw_rate, abs=2e-3)
+    assert rotation[0, 2] == pytest.approx(0.0, abs=5e-3)  # level fore and aft
+
+
+def test_factors_scale_lift_and_stride_apart(spec, model):
+    phase, velocity, turn = torch.tensor([0.79]), torch.tensor([[0.5, 0.0]]), torch.zeros(1)
+    none = StepMotion(spec, model, PERIOD, lift=0.0, stride=0.0)(phase, velocity, turn)
+    assert not none.any()
+    lift = StepMotion(spec, model, PERIOD, lift=0.5, stride=0.0)(phase, velocity, turn)[0]
+    torch.testing.assert_close(lift[0, 2:], 0.5 * torch.tensor([-0.35, 0.7, -0.35]), atol=1e-5, rtol=0)
+    assert not lift[1].any()
+    stride = StepMotion(spec, model, PERIOD, lift=0.0, stride=1.0)(phase, velocity, turn)[0]
+    both = StepMotion(spec, model, PERIOD, lift=0.5, stride=1.0)(phase, velocity, turn)[0]
+    torch.testing.assert_close(both, lift + stride)
+    assert stride[0, 2] == pytest.approx(0.0, abs=1e-3)  # the left leg passes under the hip
+    early = StepMotion(spec, model, PERIOD, lift=0.0)(torch.tensor([0.0]), velocity, turn)[0]
+    assert early[0, 2] < -0.1  # the left foot touches down in front: its hip is bent

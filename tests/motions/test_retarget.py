@@ -1,0 +1,101 @@
+"""The closed form of the arm, against the robot's own forward kinematics."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cotap.motions.quality import forward_kinematics
+from cotap.motions.retarget import (
+    HumanMotion,
+    arm_direction,
+    arm_frames,
+    choose_branch,
+    elbow_angle,
+    retarget,
+    shoulder_angles,
+    upper_arm_rotation,
+)
+
+T = 200
+SIDES = ("left", "right")
+
+
+def wave(seed: int, low, high, steps: int = T) -> np.ndarray:
+    """Smooth random joint angles (steps, n) inside limits."""
+    rng = np.random.default_rng(seed)
+    low, high = np.asarray(low), np.asarray(high)
+    phase = rng.uniform(0, 2 * np.pi, (1, len(low)))
+    t = np.linspace(0.0, 4.0, steps)[:, None]
+    return (low + high) / 2 + (high - low) / 2 * np.sin(rng.uniform(0.5, 1.5, (1, len(low))) * t + phase)
+
+
+@pytest.mark.parametrize("index", [0, 1])
+def test_shoulder_angles_invert_the_rotation(spec, index):
+    frames = arm_frames(spec, spec.arms[index])
+    sign = 1.0 if index == 0 else -1.0
+    q = wave(index, [-2.0, -0.2, -1.0], [2.0, 1.7, 1.5]) * [1.0, sign, sign]
+    solutions = shoulder_angles(frames, upper_arm_rotation(frames, q))
+    for branch in solutions:  # both give the same rotation
+        np.testing.assert_allclose(
+            upper_arm_rotation(frames, branch), upper_arm_rotation(frames, q), atol=1e-12, rtol=0
+        )
+    np.testing.assert_allclose(choose_branch(frames, solutions), q, atol=1e-9)
+
+
+@pytest.mark.parametrize("index", [0, 1])
+def test_the_rotation_is_the_robots(spec, index):
+    """Elbow position by MuJoCo-tested chains: shoulder plus the rotated upper arm."""
+    frames = arm_frames(spec, spec.arms[index])
+    sign = 1.0 if index == 0 else -1.0
+    q = wave(3, [-1.5, -0.2, -1.0], [1.5, 1.7, 1.5]) * [1.0, sign, sign]
+    joints = np.zeros((T, 8))
+    joints[:, 4 * index : 4 * index + 3] = q
+    shoulder, elbow, hand, _ = forward_kinematics(spec, joints)
+    rotation = upper_arm_rotation(frames, q)
+    np.testing.assert_allclose(
+        elbow[:, index], shoulder[:, index] + rotation @ np.array([0.0185, 0.0, -0.1343 - 0.198]), atol=1e-5
+    )
+    # With the elbow at zero the forearm points along the upper arm's x axis.
+    np.testing.assert_allclose(hand[:, index] - elbow[:, index], 0.3 * rotation[:, :, 0], atol=1e-5)
+
+
+def test_elbow_flexion_lifts_the_forearm_forward():
+    assert elbow_angle(np.array([0.0, np.pi / 2])).tolist() == pytest.approx([np.pi / 2, 0.0])
+    direction = arm_direction(np.eye(3)[None].repeat(2, 0), np.array([0.0, np.pi / 2]), 1.0)
+    np.testing.assert_allclose(direction, [[0.0, 0.0, -1.0], [np.sqrt(0.5), 0.0, -np.sqrt(0.5)]], atol=1e-12)
+
+
+def human(spec, joints: np.ndarray) -> HumanMotion:
+    """A human whose arms move exactly as these robot joints."""
+    rotations = {a.side: upper_arm_rotation(arm_frames(spec, a), joints[:, 4 * i :]) for i, a in enumerate(spec.arms)}
+    flexions = {side: np.pi / 2 - joints[:, 4 * i + 3] for i, side in enumerate(SIDES)}
+    return HumanMotion("made", np.arange(len(joints)) / 50.0, rotations, flexions, np.zeros((len(joints), 3)))
+
+
+def test_retargeting_returns_the_joints_it_was_made_from(spec):
+    joints = np.concatenate(
+        (wave(5, [-1.5, -0.2, -1.0, -1.0], [1.5, 1.6, 1.5, 1.4]),
+         wave(6, [-1.5, -1.6, -1.5, -1.0], [1.5, 0.2, 1.0, 1.4])), 1
+    )  # fmt: skip
+    np.testing.assert_allclose(retarget(spec, human(spec, joints)), joints, atol=1e-9)
+
+
+def test_branches_avoid_limits_and_jumps(spec):
+    frames = arm_frames(spec, spec.arms[0])
+    solutions = np.zeros((2, 5, 3))
+    solutions[1] = 0.5
+    solutions[0, 2, 1] = -1.0  # beyond the roll's limit of -0.34: the other branch, from there or all along
+    path = choose_branch(frames, solutions)
+    assert np.allclose(path, 0.5)
+    solutions[0, 2, 1] = 0.0
+    solutions[1, 2, 2] = 9.0
+    assert np.allclose(choose_branch(frames, solutions), 0.0)
+
+
+def test_an_arm_of_another_kind_is_refused(spec):
+    from dataclasses import replace
+
+    joints = tuple(replace(j, axis=(0.0, 0.0, 1.0)) if j.name == "left_elbow" else j for j in spec.joints)
+    with pytest.raises(ValueError, match="left arm is not shoulder pitch, roll, yaw and elbow"):
+        arm_frames(replace(spec, joints=joints), spec.arms[0])
