@@ -6,34 +6,53 @@ import json
 import math
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
 from cotap.checks import require_one_of
 from cotap.configs import from_plain, to_plain
-from cotap.evaluation.protocols import PROTOCOLS, VelocityTracking
+from cotap.evaluation.law_options import LawOptions
+from cotap.evaluation.protocols import VelocityTracking
+from cotap.evaluation.static import StaticStiffness
+
+if TYPE_CHECKING:
+    from cotap.envs import H1Env, H1EnvConfig
+    from cotap.evaluation.policy import Policy
 
 
 @dataclass
-class VelocityTrackingOptions:
-    """Commanded against measured velocity: errors, slopes, falls, gait quality."""
+class CommonOptions:
+    """What every evaluation takes."""
 
     checkpoint: str = ""
     """Checkpoint to evaluate; by default the shipped base policy."""
-    method: str = "pd"
-    """Upper-body law."""
     threads: int = 0
     """Processor threads; 0 takes every processor. Results are reproducible for one number."""
     json: str = ""
     """Write the result here."""
     plot: str = ""
-    """Write a plot of commanded against measured velocity here (PNG)."""
+    """Write a plot here (PNG)."""
+    laws: tyro.conf.OmitArgPrefixes[LawOptions] = field(default_factory=LawOptions)
+
+
+@dataclass
+class VelocityTrackingOptions(CommonOptions):
+    """Commanded against measured velocity: errors, slopes, falls, gait quality."""
+
     video: str = ""
     """Write a video of one robot on a tour of commands here (MP4); a contact sheet (PNG) goes beside it."""
     protocol: tyro.conf.OmitArgPrefixes[VelocityTracking] = field(default_factory=VelocityTracking)
+
+
+@dataclass
+class StaticStiffnessOptions(CommonOptions):
+    """Commanded against effective stiffness of a hand under a load."""
+
+    protocol: tyro.conf.OmitArgPrefixes[StaticStiffness] = field(default_factory=StaticStiffness)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -44,56 +63,72 @@ def main(argv: list[str] | None = None) -> int:
             print(f"usage: python -m cotap.evaluate PROTOCOL [options]; protocols: {', '.join(PROTOCOLS)}")
             return 0 if args else 2
         require_one_of("protocol", args[0], PROTOCOLS.keys())
-        options = tyro.cli(VelocityTrackingOptions, args=args[1:], prog=f"python -m cotap.evaluate {args[0]}")
-        velocity_tracking(options)
+        kind, run = PROTOCOLS[args[0]]
+        run(tyro.cli(kind, args=args[1:], prog=f"python -m cotap.evaluate {args[0]}"))
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     return 0
 
 
-def velocity_tracking(options: VelocityTrackingOptions) -> dict[str, Any]:
-    """Evaluate, print the table, write what was asked for, and return the result."""
+def _prepare(options: CommonOptions, protocol: Any, outputs: tuple[str, ...]) -> tuple[H1Env, Policy, str]:
+    """The policy, and the environment that the protocol makes of the one it was trained in."""
     import torch
 
-    from cotap.agents.checkpoint import require_layout, sha256, write_json
+    from cotap.agents.checkpoint import require_layout, sha256
     from cotap.envs import H1Env, H1EnvConfig
-    from cotap.evaluation.metrics import summarize, tracking_measures, tracking_slopes
     from cotap.evaluation.policy import load_policy, shipped_checkpoint
-    from cotap.evaluation.report import plot_tracking, table
-    from cotap.evaluation.rollout import record_rollout
 
-    protocol = options.protocol
-    require_one_of("method", options.method, ("pd",))
     protocol.check()
-    for name in ("json", "plot", "video"):
+    upper_body = options.laws.configure()
+    for name in outputs:
         _require_folder(name, getattr(options, name))
     if options.threads:
         torch.set_num_threads(options.threads)
     path = options.checkpoint or shipped_checkpoint("base")
     policy = load_policy(path)
     torch.manual_seed(protocol.seed)
-    cfg = protocol.configure(from_plain(H1EnvConfig, policy.config["training"]["env"]))
-    cfg.num_threads = options.threads
+    cfg: H1EnvConfig = protocol.configure(from_plain(H1EnvConfig, policy.config["training"]["env"]))
+    cfg.upper_body, cfg.num_threads = upper_body, options.threads
     env = H1Env(cfg)
     require_layout(path, policy.layout, json.loads(json.dumps(env.layout())))
+    return env, policy, sha256(path)
+
+
+def _result(name: str, options: CommonOptions, protocol: Any, env: H1Env, checkpoint: str) -> dict[str, Any]:
+    """The head of an evaluation's JSON."""
+    settings = to_plain(protocol) | to_plain(options.laws)
+    return {
+        "protocol": name,
+        "method": options.laws.method,
+        "settings": {**settings, "checkpoint_sha256": checkpoint, "env": to_plain(env.cfg)},
+        "num_envs": protocol.num_envs,
+        "num_diverged": env.num_diverged,
+    }
+
+
+def velocity_tracking(options: VelocityTrackingOptions) -> dict[str, Any]:
+    """Evaluate, print the table, write what was asked for, and return the result."""
+    from cotap.agents.checkpoint import write_json
+    from cotap.envs import H1EnvConfig
+    from cotap.evaluation.metrics import summarize, tracking_measures, tracking_slopes
+    from cotap.evaluation.report import plot_tracking, table
+    from cotap.evaluation.rollout import record_rollout
+
+    protocol = options.protocol
+    env, policy, checkpoint = _prepare(options, protocol, ("json", "plot", "video"))
     if not protocol.arm_motion:
         env.motions.hold(env.motions.default)
     start = time.perf_counter()
     trajectory = record_rollout(env, policy, round(protocol.episode_seconds / env.dt))
     seconds = time.perf_counter() - start
-    gait = cfg.commands.gait_period_s
+    gait = env.cfg.commands.gait_period_s
     measures = tracking_measures(trajectory, gait, protocol.settle_seconds)
     stood = ~trajectory.fell.any(0)
     metrics = {name: summarize(value, protocol.seed) for name, value in measures.items()}
     slopes = tracking_slopes(trajectory, gait, protocol.settle_seconds)
-    result = {
-        "protocol": "velocity-tracking",
-        "method": options.method,
-        "settings": {**to_plain(protocol), "checkpoint_sha256": sha256(path), "env": to_plain(cfg)},
-        "num_envs": protocol.num_envs,
+    result = _result("velocity-tracking", options, protocol, env, checkpoint) | {
         "num_falls": int(trajectory.fell.any(0).sum()),
-        "num_diverged": env.num_diverged,
         "seconds": seconds,
         "e_lin": metrics["e_lin"]["mean"],
         "e_yaw": metrics["e_yaw"]["mean"],
@@ -114,6 +149,38 @@ def velocity_tracking(options: VelocityTrackingOptions) -> dict[str, Any]:
         video = Path(options.video)
         tour_video(video, from_plain(H1EnvConfig, policy.config["training"]["env"]), policy, video.with_suffix(".png"))
     return result
+
+
+def static_stiffness(options: StaticStiffnessOptions) -> dict[str, Any]:
+    """Measure, print the table, write what was asked for, and return the result."""
+    from cotap.agents.checkpoint import write_json
+    from cotap.evaluation.static import measure, plot, summary, table
+
+    protocol = options.protocol
+    env, policy, checkpoint = _prepare(options, protocol, ("json", "plot"))
+    law = env.cfg.upper_body.of(protocol.hand)
+    commanded = law.stiffness if law.name == "cotap" else None
+    start = time.perf_counter()
+    measured = measure(env, protocol, policy)
+    result = _result("static-stiffness", options, protocol, env, checkpoint) | {
+        "num_falls": measured.num_falls,
+        "seconds": time.perf_counter() - start,
+        **summary(measured, commanded),
+        "window": {"start": 2.0 * protocol.settle_seconds - 1.0, "end": 2.0 * protocol.settle_seconds},
+    }
+    print(table(result))
+    if options.json:
+        write_json(Path(options.json), result)
+    if options.plot:
+        plot(Path(options.plot), measured, commanded, protocol.force)
+    return result
+
+
+PROTOCOLS: dict[str, tuple[type[Any], Callable[[Any], dict[str, Any]]]] = {
+    "velocity-tracking": (VelocityTrackingOptions, velocity_tracking),
+    "static-stiffness": (StaticStiffnessOptions, static_stiffness),
+}
+"""Every protocol's options and what runs it."""
 
 
 def _require_folder(name: str, path: str) -> None:

@@ -92,7 +92,8 @@ def changed(**changes) -> StepRecord:
 AT_REST = {"velocity_h": [[0.0, 0.0]], "torso_linear_velocity_h": [[0.0, 0.0, 0.0]]}
 # What each term gives when all is right.
 BEST = {
-    "track_velocity": 1.0, "track_velocity_closely": 1.0, "track_mean_velocity": 1.0, "track_yaw_rate": 1.0,
+    "track_velocity": 1.0, "track_velocity_closely": 1.0, "track_mean_velocity": 1.0, "track_mean_yaw_rate": 1.0,
+    "track_yaw_rate": 1.0,
     "track_yaw_rate_closely": 1.0,
     "track_height": 1.0, "track_height_widely": 1.0, "contact_schedule": 1.0, "alive": 1.0, "track_arms": 1.0,
     "track_key_points": 1.0, "track_key_velocities": 1.0,
@@ -112,6 +113,7 @@ CASES = [
     ("track_velocity", {"torso_linear_velocity_h": [[0.5, -0.2, 9.0]]}, 1.0),
     ("track_velocity_closely", {"velocity_h": [[0.6, -0.2]]}, math.exp(-0.01 / 0.04)),
     ("track_mean_velocity", {"mean_error": [[0.1, -0.05, 9.0]]}, math.exp(-(0.01 + 0.0025) / 0.015)),
+    ("track_mean_yaw_rate", {"mean_error": [[9.0, 9.0, -0.1]]}, math.exp(-0.01 / 0.02)),
     ("track_yaw_rate", {"yaw_rate": [0.1]}, math.exp(-0.09)),
     ("track_yaw_rate_closely", {"yaw_rate": [0.3]}, math.exp(-0.01 / 0.06)),
     ("track_yaw_rate_closely", {"yaw_rate": [0.5]}, math.exp(-0.01 / 0.06)),

@@ -17,6 +17,8 @@ import torch
 
 from cotap.compliance.stiffness import RANK_TOLERANCE
 
+_ROUNDING = 1e-14
+"""Share of the largest eigenvalue below which one is taken for rounding."""
 _EYE = torch.eye(3, dtype=torch.float64)
 
 
@@ -50,6 +52,9 @@ def eigenvalues_3x3(a: torch.Tensor) -> torch.Tensor:
     largest = mean + 2.0 * spread * angle.cos()
     smallest = mean + 2.0 * spread * (angle + 2.0 * torch.pi / 3.0).cos()
     middle = 3.0 * mean - largest - smallest
+    # Beside two large eigenvalues the formula loses the digits of a small one; the determinant keeps them.
+    product = (middle * largest).clamp_min(tiny)
+    smallest = torch.where(smallest < 1e-3 * largest, determinant_3x3(a) / product, smallest)
     return torch.stack((smallest, middle, largest), -1)
 
 
@@ -90,25 +95,28 @@ def blended_stiffness(
     singularity = 1.0 / (1.0 + (condition - threshold).clamp_min(0.0))
     ratio = alpha.double() * singularity
     missing = (RANK_TOLERANCE**2 * largest - squares[..., 0]).clamp_min(0.0)
-    pseudo_inverse = j.transpose(-1, -2) @ inverse_3x3(gram + missing[..., None, None] * _EYE.to(j))
     eye = torch.eye(j.shape[-1], dtype=j.dtype, device=j.device)
-    null_projector = eye - pseudo_inverse @ j
+    transposed = j.transpose(-1, -2)
+    pseudo_inverse = transposed @ inverse_3x3(gram + missing[..., None, None] * _EYE.to(j))
+    # The projector itself is as exact as doubles allow: the rank that is lost is made up for in the power below.
+    null_projector = eye - transposed @ inverse_3x3(gram + (_ROUNDING * largest)[..., None, None] * _EYE.to(j)) @ j
     if task_stiffness.dim() == jacobian.dim():
         b = torch.linalg.cholesky(task_stiffness.double()).transpose(-1, -2) @ j
     else:
         b = task_stiffness.double().sqrt().unsqueeze(-1) * j
     inner = b @ b.transpose(-1, -2)
     values = eigenvalues_3x3(inner)
-    # A direction that the arm can hardly move in is as stiff as the damped null space makes it.
-    floor = 1e-6 * values[..., 2:].clamp_min(1e-12)
-    values = values.maximum(floor)
+    values = values.maximum(_ROUNDING * values[..., 2:].clamp_min(1e-12))
     null, pd = null_stiffness.double(), pd_stiffness.double()
+    # A direction that the arm can hardly move in is as stiff as the damped null space makes it.
+    lost = missing / (squares[..., 0].clamp_min(0.0) + missing + 1e-300)
+    stiff = torch.cat((values[..., :1] + (lost * null).unsqueeze(-1), values[..., 1:]), -1)
     scale = pd.pow(1.0 - ratio)
-    power = _power(inner, values, ratio - 1.0)
+    power = _through(inner, values, stiff.pow(ratio.unsqueeze(-1)) / values, ratio - 1.0)
     of_null = null.pow(ratio)
     task = b.transpose(-1, -2) @ power @ b
     stiffness = scale[..., None, None] * (task + of_null[..., None, None] * null_projector)
-    ends = values[..., [0, 2]].pow(ratio.unsqueeze(-1))
+    ends = stiff[..., [0, 2]].pow(ratio.unsqueeze(-1))
     spectrum = torch.stack((torch.minimum(ends[..., 0], of_null), torch.maximum(ends[..., 1], of_null)), -1)
     kind = jacobian.dtype
     return ArmStiffness(
@@ -117,10 +125,13 @@ def blended_stiffness(
     )  # fmt: skip
 
 
-def _power(matrix: torch.Tensor, values: torch.Tensor, exponent: torch.Tensor) -> torch.Tensor:
-    """`matrix^exponent`, (..., 3, 3), by Newton's polynomial through its ascending eigenvalues (..., 3)."""
+def _through(matrix: torch.Tensor, values: torch.Tensor, images: torch.Tensor, exponent: torch.Tensor) -> torch.Tensor:
+    """The function (..., 3, 3) of `matrix` that takes its ascending eigenvalues to `images`, (..., 3) both.
+
+    Newton's polynomial; where eigenvalues are nearly equal, the derivatives of `x^exponent` stand in for its differences.
+    """
     low, middle, high = values.unbind(-1)
-    f_low, f_middle, f_high = (v.pow(exponent) for v in (low, middle, high))
+    f_low, f_middle, f_high = images.unbind(-1)
     first = _divided(f_low, f_middle, low, middle, exponent)
     second = _divided(f_middle, f_high, middle, high, exponent)
     gap = high - low

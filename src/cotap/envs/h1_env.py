@@ -14,6 +14,7 @@ from cotap.checks import require_all_finite, require_one_of, require_positive_in
 from cotap.compliance.kinematics import ChainPose
 from cotap.envs.commands import CommandConfig, CommandSource, leaning
 from cotap.envs.disturbances import Assistance, AssistConfig, HandForceConfig, HandForces, assist_wrench
+from cotap.envs.forces import ForceProfile, ScriptedForces
 from cotap.envs.gait import StepMotion, desired_contact, swing_progress
 from cotap.envs.impedance import ImpedanceConfig, PathFollower
 from cotap.envs.observations import (
@@ -33,7 +34,7 @@ from cotap.envs.terminations import TerminationConfig, diverged, fallen
 from cotap.envs.upper_body import UpperBody, UpperBodyConfig
 from cotap.reflection import Symmetry
 from cotap.robots import ROBOTS
-from cotap.robots.mjcf import COLLISIONS, build_model
+from cotap.robots.mjcf import COLLISIONS, FIXED_BASE_LIFT_M, build_model
 from cotap.rotations import quat_about_z, quat_from_matrix, rotate
 from cotap.sim import DelayedTargets, Simulation, Snapshot
 
@@ -101,6 +102,8 @@ class H1EnvConfig:
     """Physics steps per control step."""
     torque_limit_scale: float = 1.0
     """Factor on the robot's torque limits."""
+    fixed_base: bool = False
+    """Hold the base in the air: for measurements on the arms alone."""
     actions: ActionConfig = field(default_factory=ActionConfig)
     upper_body: UpperBodyConfig = field(default_factory=UpperBodyConfig)
     observations: ObservationConfig = field(default_factory=ObservationConfig)
@@ -111,6 +114,7 @@ class H1EnvConfig:
     terminations: TerminationConfig = field(default_factory=TerminationConfig)
     randomization: RandomizationConfig = field(default_factory=RandomizationConfig)
     hand_forces: HandForceConfig = field(default_factory=HandForceConfig)
+    force: ForceProfile = field(default_factory=ForceProfile)
     assist: AssistConfig = field(default_factory=AssistConfig)
 
     def check(self) -> None:
@@ -123,7 +127,7 @@ class H1EnvConfig:
         require_range("torque_limit_scale", self.torque_limit_scale, 1e-3, 1e3)
         for part in (
             self.actions, self.upper_body, self.observations, self.commands, self.motions, self.impedance,
-            self.terminations, self.hand_forces, self.assist,
+            self.terminations, self.hand_forces, self.force, self.assist,
         ):  # fmt: skip
             part.check()
         self.randomization.check(self.control_dt)
@@ -160,7 +164,7 @@ class H1Env(VecEnv):
         self.action_slices = {"lower": slice(0, self.num_lower), "upper": slice(self.num_lower, self.num_actions)}
         self.rng = torch.Generator().manual_seed(cfg.seed)
 
-        model = build_model(spec, cfg.collision, cfg.control_dt / cfg.substeps)
+        model = build_model(spec, cfg.collision, cfg.control_dt / cfg.substeps, cfg.fixed_base)
         model.actuator_forcerange[:] *= cfg.torque_limit_scale
         self.sim = Simulation(model, n, cfg.substeps, cfg.num_threads, Randomizer.FIELDS)
         self.dt = self.sim.dt
@@ -183,7 +187,7 @@ class H1Env(VecEnv):
         self._action_scale[self.num_lower :] = cfg.actions.upper_scale
 
         self.reader = StateReader(spec, self.sim)
-        self._arm_limits = self.reader.arm_joints(self._torque_limit.unsqueeze(0))[0]
+        self.arm_limits = self.reader.arm_joints(self._torque_limit.unsqueeze(0))[0]
         self._hand_bodies = [model.body(arm.hand_body).id for arm in spec.arms]
         self._hand_lever = torch.stack(
             [torch.tensor(a.hand_point) - torch.tensor(spec.body(a.hand_body).com) for a in spec.arms]
@@ -198,6 +202,7 @@ class H1Env(VecEnv):
         self.motions = ReferenceMotion(cfg.motions, spec, n, self.dt)
         self.path = PathFollower(cfg.impedance, n, self.dt)
         self.hand_forces = HandForces(cfg.hand_forces, n, len(spec.arms), self.dt)
+        self.scripted = ScriptedForces(cfg.force, tuple(arm.side for arm in spec.arms), n)
         self.assistance = Assistance(cfg.assist, n, self.dt)
         self.randomizer = Randomizer(cfg.randomization, spec, self.sim)
         self.upper_body = UpperBody(cfg.upper_body, spec, n)
@@ -376,6 +381,7 @@ class H1Env(VecEnv):
             "path": self.path,
             "upper_body": self.upper_body,
             "hand_forces": self.hand_forces,
+            "scripted": self.scripted,
             "assistance": self.assistance,
             "randomizer": self.randomizer,
             "history": self.history,
@@ -415,7 +421,9 @@ class H1Env(VecEnv):
         s = self.state
         to_heading = s.heading_w.transpose(1, 2) @ s.torso_rotation_w
         jacobian_h = to_heading.unsqueeze(1) @ self.reader.arm_chains.jacobian(s.arms)
-        force_h = self.hand_forces.current(jacobian_h, self._arm_limits)
+        force_h = self.hand_forces.current(jacobian_h, self.arm_limits)
+        if self.scripted.active:
+            force_h = force_h + self.scripted.at(self.dt * self.episode_length_buf)
         self._hand_force_w = (s.heading_w.unsqueeze(1) @ force_h.unsqueeze(-1)).squeeze(-1)
         hand_rotation_w = s.torso_rotation_w.unsqueeze(1) @ s.arms.rotation
         lever_w = rotate(hand_rotation_w, self._hand_lever)
@@ -551,11 +559,12 @@ class H1Env(VecEnv):
         self.motions.reset(mask, self.rng)
         self.upper_body.reset(mask)
         self.hand_forces.reset(mask, self.rng)
+        self.scripted.reset(mask, self.rng)
         joints = self._default + uniform(self.rng, -0.05, 0.05, n, self.num_actions)
         joints[:, self.num_lower :] = self.motions.current().position[mask]
         position = torch.zeros(n, 3)
-        position[:, 2] = self.spec.nominal_height_m + 0.01
-        yaw = uniform(self.rng, -math.pi, math.pi, n)
+        position[:, 2] = self.spec.nominal_height_m + (FIXED_BASE_LIFT_M if self.cfg.fixed_base else 0.01)
+        yaw = uniform(self.rng, -math.pi, math.pi, n) * (not self.cfg.fixed_base)
         qpos = torch.cat((position, quat_about_z(yaw), joints), 1)
         qvel = torch.cat((uniform(self.rng, -0.2, 0.2, n, 6), torch.zeros(n, self.num_actions)), 1)
         self.sim.reset(mask, qpos, qvel)

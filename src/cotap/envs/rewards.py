@@ -64,11 +64,12 @@ class StepRecord:
 class LowerRewards:
     """Weights of the lower agent's terms [1/s]; 0 switches a term off."""
 
-    track_velocity: float = 1.0
+    track_velocity: float = 1.5
     track_velocity_closely: float = 1.5
     track_mean_velocity: float = 2.0
     track_yaw_rate: float = 0.6
     track_yaw_rate_closely: float = 1.5
+    track_mean_yaw_rate: float = 0.8
     track_height: float = 0.75
     track_height_widely: float = 0.4
     balance: float = 0.75
@@ -135,6 +136,11 @@ def track_yaw_rate(s: StepRecord) -> torch.Tensor:
 def track_yaw_rate_closely(s: StepRecord) -> torch.Tensor:
     """As above, narrow kernel."""
     return torch.exp(-(s.command.yaw_rate - s.state.yaw_rate).square() / 0.06)
+
+
+def track_mean_yaw_rate(s: StepRecord) -> torch.Tensor:
+    """Yaw rate averaged over about half a stride."""
+    return torch.exp(-s.mean_error[:, 2].square() / 0.02)
 
 
 def track_height(s: StepRecord) -> torch.Tensor:
@@ -313,6 +319,7 @@ TERMS: dict[str, Callable[[StepRecord], torch.Tensor]] = {
         track_mean_velocity,
         track_yaw_rate,
         track_yaw_rate_closely,
+        track_mean_yaw_rate,
         track_height,
         track_height_widely,
         balance,

@@ -81,6 +81,3 @@ class VelocityTracking:
         f.force_x = f.force_y = f.force_z = (-self.hand_force, self.hand_force)
         f.zero_probability, f.curriculum_start, f.curriculum_step = 0.0, 1.0, 0.0
         return env
-
-
-PROTOCOLS = {"velocity-tracking": VelocityTracking}

@@ -16,12 +16,16 @@ _GEOM_TYPES = {
     "ellipsoid": mujoco.mjtGeom.mjGEOM_ELLIPSOID,
     "box": mujoco.mjtGeom.mjGEOM_BOX,
 }
+FIXED_BASE_LIFT_M = 0.3
+"""How much higher than standing a held base is, so that the feet hang free [m]."""
 _VISUAL_GROUP, _COLLISION_GROUP = 2, 3
 # Contact bits: the floor meets both; robot parts meet each other only in the full setting.
 _FLOOR, _PART = 1, 2
 
 
-def build_model(spec: RobotSpec, collision: str = "feet", timestep_s: float = 0.01) -> mujoco.MjModel:
+def build_model(
+    spec: RobotSpec, collision: str = "feet", timestep_s: float = 0.01, fixed_base: bool = False
+) -> mujoco.MjModel:
     """Compile `spec` on a flat floor, with a light, a following camera and foot sensors.
 
     Actuator i drives joint i with `force = ctrl - kp q - kd dq` clipped to the torque limit: `ctrl = kp target` is PD
@@ -31,11 +35,15 @@ def build_model(spec: RobotSpec, collision: str = "feet", timestep_s: float = 0.
         spec: The robot.
         collision: "feet" (feet against the floor) or "full" (all shapes, against the floor and each other).
         timestep_s: Physics step [s].
+        fixed_base: Hold the base in the air, `FIXED_BASE_LIFT_M` above where it stands.
 
     Raises:
         ValueError: `collision` is unknown.
     """
-    return build_mjspec(spec, collision, timestep_s).compile()
+    mj = build_mjspec(spec, collision, timestep_s)
+    if fixed_base:
+        _hold_base(mj, spec)
+    return mj.compile()
 
 
 def build_mjspec(spec: RobotSpec, collision: str = "feet", timestep_s: float = 0.01) -> mujoco.MjSpec:
@@ -63,6 +71,14 @@ def build_mjspec(spec: RobotSpec, collision: str = "feet", timestep_s: float = 0
         actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
         actuator.forcerange = [-joint.torque_limit_nm, joint.torque_limit_nm]
     return mj
+
+
+def _hold_base(mj: mujoco.MjSpec, spec: RobotSpec) -> None:
+    """Weld the base to the world; stiffly, since what hangs from it is measured to a tenth of a millimetre."""
+    weld = mj.add_equality(name="fixed_base", type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY)
+    weld.name1, weld.name2 = spec.base_body, "world"
+    weld.data[:] = [0.0, 0.0, 0.0, 0.0, 0.0, -(spec.nominal_height_m + FIXED_BASE_LIFT_M), 1.0, 0.0, 0.0, 0.0, 1.0]
+    weld.solimp[:3] = 0.9999, 0.9999, 0.001
 
 
 def _add_scene(mj: mujoco.MjSpec) -> None:

@@ -1,0 +1,120 @@
+"""The laws of the arms: what each torque is made of, and statics in simulation, pelvis fixed."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from cotap.compliance.dynamics import gravity_torque
+from cotap.compliance.laws import Arms, ArmState, CoTaPLaw, LawConfig, LawParameters, PDLaw
+from cotap.compliance.stiffness import resolve_joint_stiffness
+from cotap.robots.chains import arm_chains, arm_gains, arm_inertias
+
+
+@pytest.fixture
+def arms(spec) -> Arms:
+    return Arms(arm_chains(spec), arm_inertias(spec), *arm_gains(spec))
+
+
+def a_state(arms: Arms, rng, n=6, moved=0.1, base=None) -> ArmState:
+    q = torch.tensor([0.1, 0.3, 0.2, 0.3, 0.1, -0.3, -0.2, 0.3]).reshape(2, 4) + 0.1 * torch.randn(
+        n, 2, 4, generator=rng
+    )
+    turn, _ = torch.linalg.qr(torch.randn(3, 3, generator=rng))
+    turn = turn * torch.det(turn)
+    rate, target = torch.randn(n, 2, 4, generator=rng), q + moved * torch.randn(n, 2, 4, generator=rng)
+    return ArmState(q, rate, target, arms.chains.pose(q), turn.expand(n, 3, 3), base)
+
+
+def parameters(n=6, stiffness=300.0, null=25.0, alpha=1.0) -> LawParameters:
+    return LawParameters(torch.full((n, 2, 3), stiffness), torch.full((n, 2), null), torch.full((n, 2), alpha))
+
+
+def test_pd_is_pd(arms, rng):
+    state = a_state(arms, rng)
+    for law, kp in ((PDLaw(arms), 100.0), (PDLaw(arms, 30.0), 30.0)):
+        torque, report = law(state, parameters())
+        q, dq = state.position + 0.05, torch.full_like(state.position, 0.7)
+        torch.testing.assert_close(torque.at(q, dq), kp * (state.target - q) - 2.0 * dq, atol=1e-4, rtol=1e-5)
+        assert report.values == {}
+
+
+def test_alpha_zero_is_pd_with_gravity(arms, rng):
+    state = a_state(arms, rng)
+    torque, _ = CoTaPLaw(arms, LawConfig())(state, parameters(alpha=0.0))
+    pd, _ = PDLaw(arms)(state, parameters())
+    gravity = gravity_torque(arms.inertias, state.pose, state.to_heading[:, 2])
+    q, dq = state.position + 0.05, state.velocity
+    torch.testing.assert_close(torque.at(q, dq), pd.at(q, dq) + gravity, atol=2e-3, rtol=1e-4)
+
+
+def test_alpha_one_is_the_resolved_stiffness_in_the_heading_frame(arms, rng):
+    state = a_state(arms, rng)
+    p = parameters()
+    p.stiffness = torch.tensor([100.0, 300.0, 900.0]).expand(6, 2, 3)
+    torque, report = CoTaPLaw(arms, LawConfig())(state, p)
+    jacobian = state.to_heading.unsqueeze(1) @ arms.chains.jacobian(state.pose)
+    expected = resolve_joint_stiffness(jacobian, p.stiffness, 25.0)
+    torch.testing.assert_close(torque.stiffness, expected, rtol=1e-4, atol=1e-3)
+    error = state.target - state.position
+    torch.testing.assert_close(torque.elastic, (expected @ error.unsqueeze(-1)).squeeze(-1), rtol=1e-3, atol=1e-3)
+    assert float(report.values["alpha"].min()) == 1.0
+    assert not report.values["projected"].any()
+
+
+def test_task_error_pushes_the_hand_as_its_own_error_asks(arms, rng):
+    """`J#^T K_u dq_err = K_ee (x_target - x)`, at any distance: the hand's force is exact."""
+    state = a_state(arms, rng, moved=0.4)
+    p = parameters(stiffness=500.0)
+    torque, _ = CoTaPLaw(arms, LawConfig(error="task"))(state, p)
+    jacobian = state.to_heading.unsqueeze(1) @ arms.chains.jacobian(state.pose)
+    force = torch.linalg.pinv(jacobian).transpose(-1, -2) @ torque.elastic.unsqueeze(-1)
+    reach = arms.chains.pose(state.target).tip - state.pose.tip
+    expected = 500.0 * state.to_heading.unsqueeze(1) @ reach.unsqueeze(-1)
+    torch.testing.assert_close(force, expected, rtol=2e-3, atol=0.05)
+    joint, _ = CoTaPLaw(arms, LawConfig(error="joint"))(state, p)
+    assert float((joint.elastic - torque.elastic).abs().max()) > 1.0
+
+
+def test_gravity_is_against_the_vertical_wherever_the_torso_points(arms, rng):
+    state = a_state(arms, rng)
+    torque, _ = CoTaPLaw(arms, LawConfig())(state, parameters())
+    expected = gravity_torque(arms.inertias, state.pose, state.to_heading[:, 2])
+    torch.testing.assert_close(torque.feedforward, expected)
+
+
+def test_a_torso_softer_than_the_hand_is_bounded_and_counted(arms, rng):
+    base = torch.zeros(6, 2, 3, 3)
+    base[3, 1] = 0.1 * torch.eye(3)
+    torque, report = CoTaPLaw(arms, LawConfig())(a_state(arms, rng, base=base), parameters())
+    expected = torch.zeros(6, 2)
+    expected[3, 1] = 1.0
+    assert torch.equal(report.values["projected"], expected)
+    assert torch.isfinite(torque.stiffness).all()
+    assert float(torch.linalg.eigvalsh(torque.stiffness).min()) > 0.0
+
+
+def test_critical_damping_is_an_option(arms, rng):
+    state = a_state(arms, rng)
+    pd, _ = CoTaPLaw(arms, LawConfig())(state, parameters())
+    torch.testing.assert_close(pd.damping, 2.0 * torch.eye(4).expand(6, 2, 4, 4))
+    critical, _ = CoTaPLaw(arms, LawConfig(damping="critical"))(state, parameters())
+    assert float((critical.damping - pd.damping).abs().max()) > 0.1
+    assert float(torch.linalg.eigvalsh(critical.damping).min()) > 0.0
+
+
+def test_gains_that_differ_are_refused(arms):
+    kp = arms.kp.clone()
+    kp[0, 0] = 50.0
+    with pytest.raises(ValueError, match="cotap needs one position gain on all joints of an arm"):
+        CoTaPLaw(Arms(arms.chains, arms.inertias, kp, arms.kd), LawConfig())
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("name", "impedance"), ("error", "hand"), ("damping", "none"), ("stiffness", (0.0, 1.0, 1.0)),
+     ("null_stiffness", 0.0), ("alpha", 1.5), ("soft_gain", -1.0)],
+)  # fmt: skip
+def test_bad_fields_are_named(field, value):
+    with pytest.raises(ValueError, match=rf"law\.{field}"):
+        LawConfig(**{field: value}).check()

@@ -1,0 +1,79 @@
+"""The torso on its legs as springs, against a hinge worked by hand and against MuJoCo's statics."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from cotap.compliance.torso import chain_compliance, hand_base_compliance, parallel, torso_compliance
+
+DOUBLE = torch.float64
+
+
+def test_one_hinge_by_hand():
+    """An ankle of 40 Nm/rad 0.9 m below: a push of 1 N moves the body by 0.9^2 / 40 m and turns it by 0.9 / 40 rad."""
+    c = chain_compliance(
+        torch.tensor([[0.0, 1.0, 0.0]]), torch.tensor([[0.0, 0.0, -0.9]]), torch.tensor([40.0]), torch.zeros(3)
+    )
+    assert float(c[0, 0]) == pytest.approx(0.81 / 40.0)
+    assert float(c[4, 0]) == pytest.approx(0.9 / 40.0)
+    assert float(c[4, 4]) == pytest.approx(1.0 / 40.0)
+    others = [1, 2, 3, 5]
+    assert not c[others].any()
+
+
+def test_parallel_springs():
+    a, b = torch.diag(torch.tensor([2.0, 4.0], dtype=DOUBLE)), torch.diag(torch.tensor([2.0, 0.0], dtype=DOUBLE))
+    torch.testing.assert_close(parallel(a, b), torch.diag(torch.tensor([1.0, 0.0], dtype=DOUBLE)), atol=1e-9, rtol=0)
+
+
+def test_parallel_of_regular_springs_adds_their_stiffness(rng):
+    a, b = (torch.randn(20, 6, 6, dtype=DOUBLE, generator=rng) for _ in range(2))
+    a, b = (m @ m.transpose(1, 2) + 0.1 * torch.eye(6, dtype=DOUBLE) for m in (a, b))
+    expected = torch.linalg.inv(torch.linalg.inv(a) + torch.linalg.inv(b))
+    torch.testing.assert_close(parallel(a, b), expected, rtol=1e-6, atol=1e-9)
+
+
+def test_support_decides(rng):
+    legs = torch.randn(4, 2, 6, 6, dtype=DOUBLE, generator=rng)
+    legs = legs @ legs.transpose(-1, -2) + 0.1 * torch.eye(6, dtype=DOUBLE)
+    waist = 0.01 * torch.eye(6, dtype=DOUBLE).expand(4, 6, 6)
+    contact = torch.tensor([[True, True], [True, False], [False, True], [False, False]])
+    c = torso_compliance(legs, waist, contact)
+    torch.testing.assert_close(c[0], parallel(legs[0, 0], legs[0, 1]) + waist[0])
+    torch.testing.assert_close(c[1], legs[1, 0] + waist[1])
+    torch.testing.assert_close(c[2], legs[2, 1] + waist[2])
+    assert not c[3].any()  # in flight nothing holds the torso against the ground
+    # Two legs are stiffer than either, in every direction.
+    for one in (0, 1):
+        assert float(torch.linalg.eigvalsh(legs[0, one] + waist[0] - c[0]).min()) > -1e-9
+
+
+def test_hands_move_with_a_torso_that_turns():
+    """A torso that yields 0.01 rad/Nm about z: a hand 0.5 m ahead, pushed sideways, moves 0.5^2 * 0.01 m/N."""
+    torso = torch.zeros(1, 6, 6)
+    torso[0, 5, 5] = 0.01
+    c = hand_base_compliance(torso, torch.tensor([[[0.5, 0.0, 0.2], [0.0, -0.3, 0.0]]]))
+    torch.testing.assert_close(c[0, 0], torch.diag(torch.tensor([0.0, 0.0025, 0.0])))
+    torch.testing.assert_close(c[0, 1], torch.diag(torch.tensor([0.0009, 0.0, 0.0])))
+
+
+def test_support_model_against_finite_differences_of_the_legs(make_env):
+    """One foot: the torso's compliance from how its pose against the sole changes with the leg's joints."""
+    env = make_env(1)
+    env.step(torch.zeros(1, 19))
+    from cotap.envs.upper_body import TorsoComplianceConfig, _TorsoModel
+
+    model = _TorsoModel(TorsoComplianceConfig(model="support"), env.spec)
+    s = env.state
+    c = model._support(s)
+    legs_on_ground = s.foot_contact[0].tolist()
+    assert torch.isfinite(c).all()
+    if any(legs_on_ground):
+        values = torch.linalg.eigvalsh(c[0].double())
+        assert float(values.min()) > -1e-6
+        # Height of the torso above an ankle times its lean: ankles and hips of 40 to 200 Nm/rad yield by millimetres a newton.
+        assert 1e-3 < float(c[0, 0, 0]) < 0.1
+    assert math.isfinite(float(model.hand_compliance(s, s.heading_w.transpose(1, 2) @ s.torso_rotation_w).sum()))
