@@ -39,7 +39,9 @@ ROBOT = "--env.robot"
 COLLISION = "--env.collision"
 CONTROL_DT = "--env.control-dt"
 VELOCITY_X = "--env.commands.velocity-x"
-REACH = "--env.motions.reach"
+REACH = "--env.motions.generator.reach"
+BASE_CHECKPOINT = "--base-checkpoint"
+BETA = "--distillation.beta"
 EPISODE = "--env.terminations.episode-s"
 REWARD = "--env.rewards.lower.track-velocity"
 HISTORY = "--env.observations.history"
@@ -321,10 +323,97 @@ def captured(monkeypatch: pytest.MonkeyPatch, *args: Any) -> train.BaseOptions:
 
 
 @pytest.mark.parametrize("recipe", BASE_RECIPES)
-@pytest.mark.parametrize("stage", [["base"], []], ids=["base", "no stage"])
-def test_recipe_sets_the_defaults(monkeypatch: pytest.MonkeyPatch, recipe: str, stage: list[str]):
-    options = captured(monkeypatch, *stage, RECIPE, recipe, f"{ENVS}=16", SEED, 7)
+def test_recipe_sets_the_defaults(monkeypatch: pytest.MonkeyPatch, recipe: str):
+    options = captured(monkeypatch, "base", RECIPE, recipe, f"{ENVS}=16", SEED, 7)
     expected = BASE_RECIPES[recipe]()
     expected.env.num_envs, expected.seed = 16, 7
     assert options.training == expected
     assert options.recipe == recipe
+
+
+def distill(run_dir: Path, base_checkpoint: Path, *options: Any) -> dict[str, Any]:
+    """Distil for two tiny iterations and return the last checkpoint's content."""
+    small = [ENVS, 8, ITERATIONS, 2, THREADS, 1, STEPS, 6, PRECISION, "fp32"]
+    assert run("distill", *small, RUN_DIR, run_dir, BASE_CHECKPOINT, base_checkpoint, *options) == 0
+    return newest(run_dir)
+
+
+def test_distillation_begins_as_the_base_under_compliance(checkpoint: Path, tmp_path: Path):
+    content = distill(
+        tmp_path / "run", checkpoint, "--ppo.learning-rate", 1e-5, "--ppo.epochs", 1, "--ppo.mini-batches", 1, BETA, 0.3
+    )
+    base = load_checkpoint(checkpoint)
+    assert content["kind"] == "distill"
+    training = content["config"]["training"]
+    assert training["ppo"]["hidden"] == [8, 8]  # the base's
+    assert training["env"]["upper_body"]["left"]["name"] == training["env"]["upper_body"]["right"]["name"] == "cotap"
+    assert training["env"]["upper_body"]["sampling"]["enabled"]
+    assert not training["env"]["assist"]["enabled"]
+    assert training["distillation"]["beta"] == 0.3
+    for key, value in base["model"].items():
+        if key.startswith("actors"):
+            torch.testing.assert_close(content["model"][key], value, atol=1e-3, rtol=0)
+        assert torch.equal(content["learner"]["guide"][key], value), key  # the guide is the base, unchanged
+    logs = EventAccumulator(str(tmp_path / "run"))
+    logs.Reload()
+    tags = set(logs.Tags()["scalars"])
+    assert {
+        "agents/lower/base_kl", "agents/lower/base_beta", "agents/lower/base_share", "law/alpha",
+        "law/smallest_eigenvalue", "law/largest_eigenvalue", "law/projected", "law/saturated", "upper/stay_close",
+    } <= tags  # fmt: skip
+    assert logs.Scalars("agents/lower/base_beta")[0].value == pytest.approx(0.3)
+
+
+def test_a_resumed_distillation_ends_where_a_straight_one_does(checkpoint: Path, tmp_path: Path):
+    first = tmp_path / "resumed"
+    distill(first, checkpoint)
+    checkpoint_kept = checkpoint.read_bytes()
+    checkpoint.unlink()  # a run goes on without the file that it began from
+    assert run("distill", RESUME, max(first.glob("checkpoint_*.pt")), ITERATIONS, 3) == 0
+    checkpoint.write_bytes(checkpoint_kept)
+    straight = distill(tmp_path / "straight", checkpoint, ITERATIONS, 3)
+    for key, value in straight["model"].items():
+        assert torch.equal(value, newest(first)["model"][key]), key
+
+
+def test_the_papers_range_is_a_recipe(checkpoint: Path, tmp_path: Path):
+    content = distill(tmp_path / "run", checkpoint, RECIPE, "paper")
+    assert content["config"]["training"]["env"]["upper_body"]["sampling"]["stiffness"] == [150.0, 450.0]
+
+
+def test_distilling_from_a_distilled_policy_is_refused(
+    checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    path = checkpoint.with_name("distilled.pt")
+    save_checkpoint(path, load_checkpoint(checkpoint) | {"kind": "distill"})
+    before = tree(tmp_path)
+    assert run("distill", BASE_CHECKPOINT, path, RUN_DIR, tmp_path / "run", ENVS, 8) == 2
+    assert "is of stage 'distill', not 'base'" in capsys.readouterr().err
+    assert tree(tmp_path) == before
+
+
+def test_without_a_stage_both_run_and_are_summed_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any):
+    parse = train._parse_base
+
+    def tiny(args: list[str]) -> train.BaseOptions:
+        options = parse(args)
+        options.training.ppo.hidden, options.training.ppo.steps = (8, 8), 6
+        return options
+
+    monkeypatch.setattr(train, "_parse_base", tiny)
+    out = tmp_path / "both"
+    assert run(ENVS, 8, THREADS, 1, "--base-iterations", 2, "--distill-iterations", 1, RUN_DIR, out) == 0
+    assert newest(out / "base")["kind"] == "base"
+    assert newest(out / "distill")["kind"] == "distill"
+    said = capsys.readouterr().out
+    assert "| base | 2 | 96 |" in said
+    assert "| distill | 1 | 48 |" in said
+
+
+@pytest.mark.parametrize(
+    ("options", "needle"),
+    [([ENVS, 0], "num_envs"), (["--base-iterations", 0], "base_iterations"), ([THREADS, -1], "threads")],
+)
+def test_bad_options_of_both_stages_are_named(options: list[Any], needle: str, capsys: pytest.CaptureFixture[str]):
+    assert run(*options) == 2
+    assert needle in capsys.readouterr().err

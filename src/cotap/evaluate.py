@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ import tyro
 
 from cotap.checks import require_one_of
 from cotap.configs import from_plain, to_plain
+from cotap.evaluation.disturbance import ConstantLoad, Impact
 from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.protocols import VelocityTracking
 from cotap.evaluation.static import StaticStiffness
@@ -53,6 +55,20 @@ class StaticStiffnessOptions(CommonOptions):
     """Commanded against effective stiffness of a hand under a load."""
 
     protocol: tyro.conf.OmitArgPrefixes[StaticStiffness] = field(default_factory=StaticStiffness)
+
+
+@dataclass
+class ImpactOptions(CommonOptions):
+    """A blow on a hand: errors of hand, arm and torso, torques, falls."""
+
+    protocol: tyro.conf.OmitArgPrefixes[Impact] = field(default_factory=Impact)
+
+
+@dataclass
+class ConstantLoadOptions(CommonOptions):
+    """A load on a hand, held: errors of hand, arm and torso, torques, falls."""
+
+    protocol: tyro.conf.OmitArgPrefixes[ConstantLoad] = field(default_factory=ConstantLoad)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -176,9 +192,46 @@ def static_stiffness(options: StaticStiffnessOptions) -> dict[str, Any]:
     return result
 
 
+def disturbance(name: str, options: ImpactOptions | ConstantLoadOptions) -> dict[str, Any]:
+    """Measure, print the table, write what was asked for, and return the result."""
+    from cotap.agents.checkpoint import write_json
+    from cotap.evaluation.disturbance import curve, disturbance_measures, plot
+    from cotap.evaluation.metrics import summarize
+    from cotap.evaluation.report import table
+    from cotap.evaluation.rollout import record_rollout
+
+    protocol = options.protocol
+    env, policy, checkpoint = _prepare(options, protocol, ("json", "plot"))
+    protocol.command(env)
+    start = time.perf_counter()
+    steps = round(protocol.seconds / env.dt)
+    trajectory = record_rollout(env, policy, steps, arm_actions=protocol.arm_actions)
+    seconds = time.perf_counter() - start
+    sides = tuple(arm.side for arm in env.spec.arms)
+    measures = disturbance_measures(trajectory, protocol, sides)
+    stood = ~trajectory.fell.any(0)
+    curves = curve(trajectory, protocol, sides)
+    result = _result(name, options, protocol, env, checkpoint) | {
+        "num_falls": int((~stood).sum()),
+        "seconds": seconds,
+        "metrics": {key: summarize(value, protocol.seed) for key, value in measures.items()},
+        "metrics_without_falls": {key: summarize(value[stood], protocol.seed) for key, value in measures.items()},
+        "window": {"start": protocol.onset + protocol.window[0], "end": protocol.onset + protocol.window[1]},
+        "curve": curves,
+    }
+    print(table(result))
+    if options.json:
+        write_json(Path(options.json), result)
+    if options.plot:
+        plot(Path(options.plot), curves, f"{name}, {protocol.mode}, {options.laws.method}")
+    return result
+
+
 PROTOCOLS: dict[str, tuple[type[Any], Callable[[Any], dict[str, Any]]]] = {
     "velocity-tracking": (VelocityTrackingOptions, velocity_tracking),
     "static-stiffness": (StaticStiffnessOptions, static_stiffness),
+    "impact": (ImpactOptions, partial(disturbance, "impact")),
+    "constant-load": (ConstantLoadOptions, partial(disturbance, "constant-load")),
 }
 """Every protocol's options and what runs it."""
 

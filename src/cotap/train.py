@@ -1,4 +1,4 @@
-"""`python -m cotap.train`: train policies from the command line."""
+"""`python -m cotap.train`: train policies from the command line; without a stage, both, one after the other."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from typing import Annotated, Any
 import tyro
 
 from cotap import __version__
-from cotap.checks import require_one_of
-from cotap.configs import BASE_RECIPES, BaseTraining, from_plain, to_plain
+from cotap.checks import require_one_of, require_positive_int, require_range
+from cotap.configs import BASE_RECIPES, DISTILL_RECIPES, BaseTraining, DistillTraining, from_plain, to_plain
 
 SHORTCUTS = {"--num-envs": "--env.num-envs", "--iterations": "--runner.iterations"}
+STAGES = ("base", "distill")
 
 
 @dataclass
@@ -37,37 +38,112 @@ class BaseOptions:
     training: Annotated[BaseTraining, tyro.conf.arg(name="")] = field(default_factory=BASE_RECIPES["default"])
 
 
+@dataclass
+class DistillOptions:
+    """Stage 2: arms under compliance, a policy that begins as the base and is guided by it while it learns.
+
+    `--num-envs` and `--iterations` are short for `--env.num-envs` and `--runner.iterations`.
+    """
+
+    run_dir: str = ""
+    """Where the run goes; by default runs/distill-DATE-TIME, or the resumed checkpoint's folder."""
+    resume: str = ""
+    """Checkpoint of a distillation to go on from; its config is the default for every option."""
+    base_checkpoint: str = ""
+    """Base policy to begin from and to be guided by; by default the shipped one."""
+    recipe: str = "default"
+    """default (80 to 1200 N/m), or paper (150 to 450 N/m)."""
+    command: tyro.conf.Suppress[str] = ""
+    training: Annotated[DistillTraining, tyro.conf.arg(name="")] = field(default_factory=DistillTraining)
+
+
+@dataclass
+class PipelineOptions:
+    """Both stages, one after the other: a base policy, then its distillation. For more options, train stage by stage:
+    `python -m cotap.train base --help`, `python -m cotap.train distill --help`."""
+
+    run_dir: str = ""
+    """Where the runs go, into folders `base` and `distill`; by default runs/cotap-DATE-TIME."""
+    num_envs: int = 1024
+    """Number of worlds."""
+    base_iterations: int = 1300
+    """Iterations of stage 1."""
+    distill_iterations: int = 400
+    """Iterations of stage 2."""
+    seed: int = 0
+    """Seed of both stages."""
+    threads: int = 0
+    """Processor threads; 0 takes every processor."""
+
+    def check(self) -> None:
+        """Raise ValueError naming the first field that is out of its range."""
+        for name in ("num_envs", "base_iterations", "distill_iterations"):
+            require_positive_int(name, getattr(self, name))
+        require_range("threads", self.threads, 0, 4096)
+
+
 def main(argv: list[str] | None = None) -> int:
     """Parse, train, report. Returns the exit status: 0, or 2 for bad input."""
     args = list(sys.argv[1:] if argv is None else argv)
-    stage = args.pop(0) if args and not args[0].startswith("-") else "base"
+    stage = args.pop(0) if args and not args[0].startswith("-") else ""
     try:
-        require_one_of("stage", stage, ("base",))
-        options = _parse(args)
+        if not stage:
+            train_both(tyro.cli(PipelineOptions, args=args, prog="python -m cotap.train"))
+            return 0
+        require_one_of("stage", stage, STAGES)
+        options = _parse_base(args) if stage == "base" else _parse_distill(args)
         options.command = " ".join(["python -m cotap.train", stage, *args])
-        train_base(options)
+        if isinstance(options, BaseOptions):
+            train_base(options)
+        else:
+            train_distill(options)
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:  # asked to stop twice
+        print("interrupted before the checkpoint was saved; the last one is whole", file=sys.stderr)
+        return 130
     return 0
 
 
-def _parse(args: list[str]) -> BaseOptions:
-    """Options on top of the resumed checkpoint's config, or else of the recipe's."""
-    from cotap.agents.checkpoint import CheckpointError, load_checkpoint
+def _expand(args: list[str]) -> list[str]:
+    return [SHORTCUTS.get(key, key) + sep + value for key, sep, value in (a.partition("=") for a in args)]
 
-    args = [SHORTCUTS.get(key, key) + sep + value for key, sep, value in (a.partition("=") for a in args)]
-    first: Any = _peek(args, "--resume")
+
+def _parse_base(args: list[str]) -> BaseOptions:
+    """Options on top of the resumed checkpoint's config, or else of the recipe's."""
+    args = _expand(args)
     recipe = require_one_of("recipe", _peek(args, "--recipe") or "default", BASE_RECIPES.keys())
-    training = BASE_RECIPES[recipe]()
-    if first:
-        content = load_checkpoint(first)
-        try:
-            training = from_plain(BaseTraining, content["config"]["training"])
-        except (KeyError, TypeError, ValueError) as error:
-            raise CheckpointError(f"checkpoint {first!r} has no usable config: {error}") from error
+    resumed = _peek(args, "--resume")
+    training = _config_of(resumed, BaseTraining) if resumed else BASE_RECIPES[recipe]()
     default = BaseOptions(recipe=recipe, training=training)
     return tyro.cli(BaseOptions, args=args, default=default, prog="python -m cotap.train base")
+
+
+def _parse_distill(args: list[str]) -> DistillOptions:
+    """Options on top of the resumed checkpoint's config, or else of what the recipe makes of the base's."""
+    from cotap.evaluation.policy import shipped_checkpoint
+
+    args = _expand(args)
+    recipe = require_one_of("recipe", _peek(args, "--recipe") or "default", DISTILL_RECIPES.keys())
+    resumed, base = _peek(args, "--resume"), _peek(args, "--base-checkpoint")
+    if resumed:
+        training = _config_of(resumed, DistillTraining)
+    else:
+        base = base or str(shipped_checkpoint("base"))
+        training = DISTILL_RECIPES[recipe](_config_of(base, BaseTraining))
+    default = DistillOptions(recipe=recipe, base_checkpoint=base, training=training)
+    return tyro.cli(DistillOptions, args=args, default=default, prog="python -m cotap.train distill")
+
+
+def _config_of(checkpoint: str, kind: type[Any]) -> Any:
+    from cotap.agents.checkpoint import CheckpointError, load_checkpoint
+
+    content = load_checkpoint(checkpoint)
+    try:
+        return from_plain(kind, content["config"]["training"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(f"checkpoint {checkpoint!r} has no usable config: {error}") from error
 
 
 def _peek(args: list[str], option: str) -> str:
@@ -81,6 +157,29 @@ def _peek(args: list[str], option: str) -> str:
 
 def train_base(options: BaseOptions) -> Path:
     """Run stage 1. Returns the run directory."""
+    return _train("base", options, None)
+
+
+def train_distill(options: DistillOptions) -> Path:
+    """Run stage 2. Returns the run directory.
+
+    Raises:
+        CheckpointError: the base checkpoint cannot be used, is not of stage 1, or has other networks.
+    """
+    from cotap.agents.checkpoint import CheckpointError, load_checkpoint
+
+    base = None
+    if not options.resume:
+        base = load_checkpoint(options.base_checkpoint)
+        if base.get("kind") != "base":
+            raise CheckpointError(
+                f"checkpoint {options.base_checkpoint!r} is of stage {base.get('kind')!r}, not 'base'"
+            )
+    return _train("distill", options, base)
+
+
+def _train(stage: str, options: BaseOptions | DistillOptions, base: dict[str, Any] | None) -> Path:
+    """What both stages share. `base` is the checkpoint that a distillation begins from."""
     import torch
 
     from cotap.agents.runner import DualRunner, check_run_dir
@@ -88,14 +187,18 @@ def train_base(options: BaseOptions) -> Path:
 
     training = options.training
     resumed_dir = Path(options.resume).parent if options.resume else None
-    run_dir = Path(options.run_dir) if options.run_dir else resumed_dir or _new_run_dir("base")
+    run_dir = Path(options.run_dir) if options.run_dir else resumed_dir or _new_run_dir(stage)
     training.env.seed, training.env.num_threads = training.seed, training.threads
     training.check()
     if training.threads:
         torch.set_num_threads(training.threads)
     torch.manual_seed(training.seed)
-    config = {"stage": "base", "training": to_plain(training), **_provenance(options.command)}
-    runner = DualRunner(H1Env(training.env), training.runner, training.ppo, run_dir, config, training.device)
+    config = {"stage": stage, "training": to_plain(training), **_provenance(options.command)}
+    env = H1Env(training.env)
+    guide = _guide(env, options, base) if isinstance(options, DistillOptions) else None
+    runner = DualRunner(env, training.runner, training.ppo, run_dir, config, training.device, guide)
+    if guide and not options.resume:
+        runner.alg.model.load_state_dict(guide.model.state_dict())
     if options.resume:
         runner.load(options.resume)
     # Last, so that nothing is left behind when any of the above refuses.
@@ -103,6 +206,66 @@ def train_base(options: BaseOptions) -> Path:
     runner.learn(init_at_random_ep_len=True)
     print(f"{runner.current_learning_iteration} iterations, {runner.wall_seconds:.0f} s: {run_dir}")
     return run_dir
+
+
+def _guide(env: Any, options: DistillOptions, base: dict[str, Any] | None) -> Any:
+    """The frozen base; of a resumed run, one whose weights the checkpoint brings."""
+    import json
+
+    from cotap.agents.actors import DualActorCritic
+    from cotap.agents.checkpoint import CheckpointError, require_layout
+    from cotap.agents.distillation import Guide
+    from cotap.agents.runner import layout_of
+
+    training = options.training
+    model = DualActorCritic(layout_of(env), training.ppo.hidden, training.ppo.initial_std)
+    if base is not None:
+        require_layout(options.base_checkpoint, base["layout"], json.loads(json.dumps(env.layout())))
+        try:
+            model.load_state_dict(base["model"])
+        except RuntimeError as error:
+            raise CheckpointError(f"checkpoint {options.base_checkpoint!r} has other networks: {error}") from error
+    return Guide(model.to(training.device), training.distillation)
+
+
+def train_both(options: PipelineOptions) -> Path:
+    """Run stage 1, then stage 2 from its result, and sum both up. Returns the directory of both."""
+    options.check()
+    run_dir = Path(options.run_dir) if options.run_dir else _new_run_dir("cotap")
+    common = ["--num-envs", str(options.num_envs), "--seed", str(options.seed), "--threads", str(options.threads)]
+    base_args = [*common, "--iterations", str(options.base_iterations), "--run-dir", str(run_dir / "base")]
+    base = _parse_base(base_args)
+    base.command = " ".join(["python -m cotap.train base", *base_args])
+    checkpoint = str(_newest(train_base(base)))
+    distill_args = [
+        *common, "--base-checkpoint", checkpoint, "--iterations", str(options.distill_iterations),
+        "--run-dir", str(run_dir / "distill"),
+    ]  # fmt: skip
+    distill = _parse_distill(distill_args)
+    distill.command = " ".join(["python -m cotap.train distill", *distill_args])
+    train_distill(distill)
+    print(_summary(run_dir))
+    return run_dir
+
+
+def _newest(run_dir: Path) -> Path:
+    from cotap.agents.runner import CHECKPOINT_PATTERN
+
+    return max(run_dir.glob(CHECKPOINT_PATTERN))
+
+
+def _summary(run_dir: Path) -> str:
+    """What each stage took, as a Markdown table."""
+    from cotap.agents.checkpoint import load_checkpoint
+
+    lines = ["| stage | iterations | samples | seconds | checkpoint |", "|---|---|---|---|---|"]
+    for stage in STAGES:
+        path = _newest(run_dir / stage)
+        content = load_checkpoint(path)
+        lines.append(
+            f"| {stage} | {content['iteration']} | {content['samples']:,} | {content['wall_seconds']:.0f} | {path} |"
+        )
+    return "\n".join(lines)
 
 
 def _provenance(command: str) -> dict[str, str]:

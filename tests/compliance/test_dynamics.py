@@ -30,7 +30,7 @@ def mujoco_data(spec, model, q, quat):
     return data
 
 
-def arm_dofs(spec, model, arm):
+def arm_dofs(model, arm):
     return [model.joint(n).dofadr[0] for n in arm.joints]
 
 
@@ -42,7 +42,7 @@ def test_gravity_torque_is_mujocos_bias_at_rest(spec, model):
     for i in range(50):
         data = mujoco_data(spec, model, q[i], quat[i])  # the waist is at zero: the torso stands as the pelvis does
         for a, arm in enumerate(spec.arms):
-            np.testing.assert_allclose(torque[i, a], data.qfrc_bias[arm_dofs(spec, model, arm)], atol=2e-5)
+            np.testing.assert_allclose(torque[i, a], data.qfrc_bias[arm_dofs(model, arm)], atol=2e-5)
     assert float(torque.abs().max()) > 3.0
 
 
@@ -69,7 +69,7 @@ def test_gravity_torque_in_double_precision_to_a_millionth(spec, model):
     for i in range(20):
         data = mujoco_data(spec, model, q[i], quat[i])
         for a, arm in enumerate(spec.arms):
-            np.testing.assert_allclose(torque[i, a], data.qfrc_bias[arm_dofs(spec, model, arm)], atol=1e-6)
+            np.testing.assert_allclose(torque[i, a], data.qfrc_bias[arm_dofs(model, arm)], atol=1e-6)
 
 
 def test_inertia_is_mujocos(spec, model):
@@ -82,7 +82,7 @@ def test_inertia_is_mujocos(spec, model):
         for row, column in zip(full, columns, strict=True):
             mujoco.mj_mulM(model, data, row, column)
         for a, arm in enumerate(spec.arms):
-            dofs = arm_dofs(spec, model, arm)
+            dofs = arm_dofs(model, arm)
             np.testing.assert_allclose(inertia[i, a], full[np.ix_(dofs, dofs)], atol=2e-5)
 
 

@@ -118,11 +118,11 @@ def test_other_bad_input_is_named(rng):
     with pytest.raises(ValueError, match="matrix must be positive definite, got an eigenvalue of -1"):
         spd_log(torch.diag(torch.tensor([1.0, -1.0])))
     for alpha in (-0.1, 1.1, math.nan):
-        with pytest.raises(ValueError, match="alpha must"):
+        with pytest.raises(ValueError, match=r"alpha must"):
             modulate_stiffness(k, k, alpha)
-    with pytest.raises(ValueError, match="weights must sum to 1, got 0.9"):
+    with pytest.raises(ValueError, match=r"weights must sum to 1, got 0\.9"):
         log_euclidean_mean(k, torch.tensor([0.5, 0.4]))
-    with pytest.raises(ValueError, match="weights must not be negative, got -0.5"):
+    with pytest.raises(ValueError, match=r"weights must not be negative, got -0\.5"):
         log_euclidean_mean(k, torch.tensor([1.5, -0.5]))
     with pytest.raises(ValueError, match=r"weights must have shape \(\.\.\., 2\)"):
         log_euclidean_mean(k, torch.ones(3) / 3)

@@ -74,6 +74,6 @@ def test_support_model_against_finite_differences_of_the_legs(make_env):
     if any(legs_on_ground):
         values = torch.linalg.eigvalsh(c[0].double())
         assert float(values.min()) > -1e-6
-        # Height of the torso above an ankle times its lean: ankles and hips of 40 to 200 Nm/rad yield by millimetres a newton.
+        # Ankles and hips of 40 to 200 Nm/rad, a metre below, yield by millimetres a newton.
         assert 1e-3 < float(c[0, 0, 0]) < 0.1
     assert math.isfinite(float(model.hand_compliance(s, s.heading_w.transpose(1, 2) @ s.torso_rotation_w).sum()))

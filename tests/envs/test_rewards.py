@@ -57,6 +57,7 @@ def perfect() -> StepRecord:
         last_action=zero.clone(),
         joint_acceleration=zero.clone(),
         torque=zero.clone(),
+        arm_target=torch.zeros(1, 2),
         desired_contact=torch.tensor([[True, True]]),
         swing=torch.zeros(1, 2),
         key_points_t=points,
@@ -96,7 +97,7 @@ BEST = {
     "track_yaw_rate": 1.0,
     "track_yaw_rate_closely": 1.0,
     "track_height": 1.0, "track_height_widely": 1.0, "contact_schedule": 1.0, "alive": 1.0, "track_arms": 1.0,
-    "track_key_points": 1.0, "track_key_velocities": 1.0,
+    "stay_close": 1.0, "track_key_points": 1.0, "track_key_velocities": 1.0,
 }  # fmt: skip
 ALL_TERMS = sorted({f.name for group in (LowerRewards, UpperRewards) for f in dataclasses.fields(group)})
 
@@ -158,6 +159,7 @@ CASES = [
     ("upper_action_rate", {"action": [[9, 9, 9, 1, -1.0]], "last_action": [[0, 0, 0, 2, 1.0]]}, 5.0),
     ("lower_joint_limits", {"joint_pos": [[-0.7, 0.6, 0.5, 9.0, -9.0]]}, 0.3),
     ("upper_joint_limits", {"joint_pos": [[9.0, -9.0, 9.0, 0.7, -0.6]]}, 0.3),
+    ("stay_close", {"arm_target": [[0.3, 0.0]], "position": [[0.0, 0.4]]}, math.exp(-2.0 * 0.5)),
     ("alive", {"fell": [True]}, 0.0),
     ("fall", {"fell": [True]}, 1.0),
     ("track_arms", {"joint_pos": [[9.0, 9.0, 9.0, 0.1, -0.2]]}, math.exp(-0.05 / 0.06)),

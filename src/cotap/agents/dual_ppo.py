@@ -10,6 +10,7 @@ import torch
 from torch import nn
 
 from cotap.agents.actors import AgentLayout, DualActorCritic, Observations
+from cotap.agents.distillation import Guide
 from cotap.agents.losses import (
     adapt_learning_rate,
     clipped_surrogate,
@@ -62,8 +63,9 @@ class DualPPOConfig:
     """auto, bf16 or fp32."""
     normalizer_stride: int = 4
     """Observations of every so many steps update the normalisers."""
-    mirrored_share: float = 0.5
-    """Share of samples that are replaced by their left-right mirror image, where the environment tells what that is."""
+    mirrored_share: float = 0.0
+    """Share of samples that are replaced by their left-right mirror image, where the environment tells what that is.
+    Harmful once the spread of actions is small: the policy's own asymmetry then clips most of them."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
@@ -98,6 +100,7 @@ class Rollout:
     observations: Observations
     actions: torch.Tensor
     means: torch.Tensor
+    guide_means: torch.Tensor | None
     log_probs: torch.Tensor
     values: torch.Tensor
     rewards: torch.Tensor
@@ -115,14 +118,16 @@ class DualPPO:
         cfg: Hyperparameters.
         device: Where the networks live.
         symmetry: Mirror images of observations and actions; None for a task that has no symmetry.
+        guide: A frozen policy that agents are kept close to at first; None for none.
     """
 
     def __init__(
         self, layout: AgentLayout, num_envs: int, cfg: DualPPOConfig, device: str = "cpu",
-        symmetry: Symmetry | None = None,
+        symmetry: Symmetry | None = None, guide: Guide | None = None,
     ) -> None:  # fmt: skip
         cfg.check()
         self.cfg, self.device, self.layout = cfg, device, layout
+        self.guide = guide
         self.symmetry = symmetry.to(device) if symmetry and cfg.mirrored_share > 0.0 else None
         self.dtype = resolve_precision(cfg.precision, device)
         self.names = tuple(layout.action_slices)
@@ -154,6 +159,7 @@ class DualPPO:
             observations={k: buffer(layout.observation_widths[k], self.dtype) for k in self.model.normalizers},
             actions=buffer(a),
             means=buffer(a),
+            guide_means=buffer(a) if guide else None,
             log_probs=buffer(g),
             values=buffer(g),
             rewards=buffer(g),
@@ -183,6 +189,8 @@ class DualPPO:
         std = torch.cat([model.log_std[n].exp() for n in self.names])
         actions = mean + std * torch.randn_like(mean)
         r.means[t], r.actions[t] = mean, actions
+        if self.guide and r.guide_means is not None:
+            r.guide_means[t] = self.guide.mean_action(observations)
         for g, name in enumerate(self.names):
             part = self.layout.action_slices[name]
             r.log_probs[t, :, g] = gaussian_log_prob(actions[:, part], mean[:, part], model.log_std[name])
@@ -216,6 +224,8 @@ class DualPPO:
             key: getattr(r, key).flatten(0, 1)
             for key in ("actions", "means", "log_probs", "values", "returns", "advantages")
         }
+        if r.guide_means is not None:
+            flat["guide_means"] = r.guide_means.flatten(0, 1)
         observations = {g: v.flatten(0, 1) for g, v in r.observations.items()}
         old_log_std = {n: self.model.log_std[n].detach().clone() for n in self.names}
         total = flat["actions"].shape[0]
@@ -237,6 +247,8 @@ class DualPPO:
         log = {key: float(value) / count for key, value in sums.items()}
         for name in self.names:
             log[f"{name}/learning_rate"] = self.learning_rates[name]
+            if self.guide and name in self.guide.cfg.agents:
+                log[f"{name}/base_beta"] = self.guide.beta(self.iterations - 1)
             log[f"{name}/action_std"] = float(self.model.log_std[name].detach().exp().mean())
         return log
 
@@ -257,7 +269,7 @@ class DualPPO:
         share = slice(0, self._num_mirrored(batch))
         for group, value in inputs.items():
             value[share] = self.symmetry.observations[group](value[share])
-        for key in ("actions", "means"):
+        for key in {"actions", "means", "guide_means"} & batch.keys():
             batch[key][share] = self.symmetry.actions(batch[key][share])
 
     def _num_mirrored(self, batch: dict[str, torch.Tensor]) -> int:
@@ -283,6 +295,13 @@ class DualPPO:
         value_loss = clipped_value_loss(value, batch["values"][:, g], batch["returns"][:, g], cfg.clip)
         entropy = gaussian_entropy(log_std)
         loss = surrogate + cfg.value * value_loss - cfg.entropy * entropy
+        stats = {"surrogate": surrogate.detach(), "value": value_loss.detach(), "entropy": entropy.detach(), "kl": kl}
+        if self.guide and name in self.guide.cfg.agents:
+            distance = self.guide.kl(name, mean, log_std, batch["guide_means"][:, part])
+            penalty = self.guide.beta(self.iterations) * distance
+            loss = loss + penalty
+            share = penalty / (penalty + surrogate.abs() + cfg.entropy * entropy.abs() + 1e-12)
+            stats |= {"base_kl": distance.detach(), "base_share": share.detach()}
         optimizer = self.optimizers[name]
         optimizer.zero_grad()
         loss.backward()
@@ -291,7 +310,7 @@ class DualPPO:
         for group in optimizer.param_groups:
             group["lr"] = self.learning_rates[name]
         optimizer.step()
-        return {"surrogate": surrogate.detach(), "value": value_loss.detach(), "entropy": entropy.detach(), "kl": kl}
+        return stats
 
     def state_dict(self) -> dict[str, Any]:
         """Optimisers, learning rates and number of updates; the networks are saved apart."""
@@ -299,6 +318,7 @@ class DualPPO:
             "optimizers": {name: opt.state_dict() for name, opt in self.optimizers.items()},
             "learning_rates": dict(self.learning_rates),
             "iterations": self.iterations,
+            "guide": self.guide.state_dict() if self.guide else {},
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -307,3 +327,5 @@ class DualPPO:
             opt.load_state_dict(state["optimizers"][name])
         self.learning_rates = dict(state["learning_rates"])
         self.iterations = state["iterations"]
+        if self.guide and state["guide"]:
+            self.guide.load_state_dict(state["guide"])

@@ -19,6 +19,7 @@ from tqdm import tqdm
 
 from cotap.agents.actors import AgentLayout, as_dict
 from cotap.agents.checkpoint import CheckpointError, load_checkpoint, require_layout, save_checkpoint, write_json
+from cotap.agents.distillation import Guide
 from cotap.agents.dual_ppo import DualPPO, DualPPOConfig
 from cotap.checks import require_positive_int
 
@@ -55,12 +56,10 @@ def check_run_dir(run_dir: Path, resuming: bool) -> None:
     """
     if run_dir.exists() and not run_dir.is_dir():
         raise ValueError(f"run directory {str(run_dir)!r} is a file")
-    if not resuming and any(run_dir.glob(CHECKPOINT_PATTERN)):
-        newest = max(run_dir.glob(CHECKPOINT_PATTERN))
-        raise ValueError(
-            f"run directory {str(run_dir)!r} already holds a run; go on with --resume {newest}, "
-            "or choose another --run-dir"
-        )
+    if not resuming and ((run_dir / "config.json").exists() or any(run_dir.glob(CHECKPOINT_PATTERN))):
+        newest = max(run_dir.glob(CHECKPOINT_PATTERN), default=None)
+        way_on = f"go on with --resume {newest}, or choose" if newest else "it has no checkpoint to go on from; choose"
+        raise ValueError(f"run directory {str(run_dir)!r} already holds a run; {way_on} another --run-dir")
     run_dir.mkdir(parents=True, exist_ok=True)
     probe = run_dir / ".writable"
     probe.touch()
@@ -78,16 +77,17 @@ class DualRunner(OnPolicyRunner):
         run_dir: Where checkpoints and TensorBoard logs go.
         config: The resolved config as plain data, saved beside the run and in every checkpoint.
         device: Where the networks live.
+        guide: A frozen policy to stay close to at first.
     """
 
     def __init__(
         self, env: VecEnv, cfg: RunnerConfig, ppo: DualPPOConfig, run_dir: Path, config: dict[str, Any],
-        device: str = "cpu",
+        device: str = "cpu", guide: Guide | None = None,
     ) -> None:  # fmt: skip
         cfg.check()
         self.env, self.runner_cfg, self.run_dir, self.config, self.device = env, cfg, run_dir, config, device
         symmetry = getattr(env, "symmetry", None)
-        self.alg: DualPPO = DualPPO(layout_of(env), env.num_envs, ppo, device, symmetry)  # pyright: ignore
+        self.alg: DualPPO = DualPPO(layout_of(env), env.num_envs, ppo, device, symmetry, guide)  # pyright: ignore
         self.current_learning_iteration = 0
         self.wall_seconds = 0.0
         self._stop = False
@@ -149,11 +149,13 @@ class DualRunner(OnPolicyRunner):
 
     def save(self, path: str | None = None, infos: dict | None = None) -> None:
         """Save everything to go on exactly; the previous checkpoint then sheds its simulator states."""
+        if self.alg.guide:
+            self.alg.guide.verify()
         target = Path(path) if path else self.run_dir / f"checkpoint_{self.current_learning_iteration:06d}.pt"
         save_checkpoint(target, self._content() | {"infos": infos or {}})
-        for older in sorted(self.run_dir.glob(CHECKPOINT_PATTERN)):
-            if older < target:
-                _shed_simulator_states(older)
+        older = [path for path in self.run_dir.glob(CHECKPOINT_PATTERN) if path < target]
+        if older:
+            _shed_simulator_states(max(older))
 
     def load(self, path: str, *_: Any, map_location: str | None = None, **__: Any) -> dict:
         """Load a checkpoint. What it lacks (a shipped one has no optimiser or simulator states) starts afresh.

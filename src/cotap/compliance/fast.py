@@ -19,7 +19,6 @@ from cotap.compliance.stiffness import RANK_TOLERANCE
 
 _ROUNDING = 1e-14
 """Share of the largest eigenvalue below which one is taken for rounding."""
-_EYE = torch.eye(3, dtype=torch.float64)
 
 
 @dataclass(frozen=True)
@@ -42,32 +41,44 @@ class ArmStiffness:
 
 def eigenvalues_3x3(a: torch.Tensor) -> torch.Tensor:
     """Eigenvalues (..., 3), ascending, of symmetric positive semidefinite matrices (..., 3, 3)."""
-    diagonal = torch.diagonal(a, dim1=-2, dim2=-1)
-    off = a[..., 0, 1].square() + a[..., 0, 2].square() + a[..., 1, 2].square()
-    mean = diagonal.mean(-1)
-    spread = (((diagonal - mean.unsqueeze(-1)).square().sum(-1) + 2.0 * off) / 6.0).sqrt()
+    xx, xy, xz, yy, yz, zz = _entries(a)
+    mean = (xx + yy + zz) / 3.0
+    dx, dy, dz = xx - mean, yy - mean, zz - mean
+    xy2, xz2, yz2 = xy * xy, xz * xz, yz * yz
+    square = (dx * dx + dy * dy + dz * dz + 2.0 * (xy2 + xz2 + yz2)) / 6.0
+    spread = square.sqrt()
     tiny = torch.finfo(a.dtype).tiny
-    b = (a - mean[..., None, None] * _EYE.to(a)) / spread.clamp_min(tiny)[..., None, None]
-    angle = torch.acos((0.5 * determinant_3x3(b)).clamp(-1.0, 1.0)) / 3.0
+    determinant = dx * (dy * dz - yz2) - xy2 * dz - xz2 * dy + 2.0 * xy * xz * yz
+    angle = torch.acos((0.5 * determinant / (square * spread).clamp_min(tiny)).clamp_(-1.0, 1.0)) / 3.0
     largest = mean + 2.0 * spread * angle.cos()
     smallest = mean + 2.0 * spread * (angle + 2.0 * torch.pi / 3.0).cos()
     middle = 3.0 * mean - largest - smallest
     # Beside two large eigenvalues the formula loses the digits of a small one; the determinant keeps them.
     product = (middle * largest).clamp_min(tiny)
-    smallest = torch.where(smallest < 1e-3 * largest, determinant_3x3(a) / product, smallest)
+    whole = xx * (yy * zz - yz2) - xy2 * zz - xz2 * yy + 2.0 * xy * xz * yz
+    smallest = torch.where(smallest < 1e-3 * largest, whole / product, smallest)
     return torch.stack((smallest, middle, largest), -1)
 
 
-def determinant_3x3(a: torch.Tensor) -> torch.Tensor:
-    """Determinants (...) of (..., 3, 3)."""
-    return (a[..., 0, :] * torch.linalg.cross(a[..., 1, :], a[..., 2, :])).sum(-1)
-
-
 def inverse_3x3(a: torch.Tensor) -> torch.Tensor:
-    """Inverses (..., 3, 3) of (..., 3, 3)."""
-    rows = a.unbind(-2)
-    columns = torch.stack([torch.linalg.cross(rows[i - 2], rows[i - 1]) for i in range(3)], -1)
-    return columns / (rows[0] * columns[..., 0]).sum(-1)[..., None, None]
+    """Inverses (..., 3, 3) of symmetric matrices (..., 3, 3)."""
+    xx, xy, xz, yy, yz, zz = _entries(a)
+    cxx, cxy, cxz = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
+    cyy, cyz, czz = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
+    adjugate = torch.stack((cxx, cxy, cxz, cxy, cyy, cyz, cxz, cyz, czz), -1)
+    return (adjugate / (xx * cxx + xy * cxy + xz * cxz).unsqueeze(-1)).unflatten(-1, (3, 3))
+
+
+def _entries(a: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    """The six different entries (...) of symmetric matrices (..., 3, 3), each contiguous."""
+    return a.flatten(-2)[..., [0, 1, 2, 4, 5, 8]].movedim(-1, 0).contiguous().unbind(0)
+
+
+def _plus(a: torch.Tensor, shift: torch.Tensor) -> torch.Tensor:
+    """`a + shift I` for matrices (..., 3, 3) and numbers (...)."""
+    out = a.clone()
+    torch.diagonal(out, dim1=-2, dim2=-1).add_(shift.unsqueeze(-1))
+    return out
 
 
 def blended_stiffness(
@@ -97,9 +108,9 @@ def blended_stiffness(
     missing = (RANK_TOLERANCE**2 * largest - squares[..., 0]).clamp_min(0.0)
     eye = torch.eye(j.shape[-1], dtype=j.dtype, device=j.device)
     transposed = j.transpose(-1, -2)
-    pseudo_inverse = transposed @ inverse_3x3(gram + missing[..., None, None] * _EYE.to(j))
+    pseudo_inverse = transposed @ inverse_3x3(_plus(gram, missing))
     # The projector itself is as exact as doubles allow: the rank that is lost is made up for in the power below.
-    null_projector = eye - transposed @ inverse_3x3(gram + (_ROUNDING * largest)[..., None, None] * _EYE.to(j)) @ j
+    null_projector = eye - transposed @ inverse_3x3(_plus(gram, _ROUNDING * largest)) @ j
     if task_stiffness.dim() == jacobian.dim():
         b = torch.linalg.cholesky(task_stiffness.double()).transpose(-1, -2) @ j
     else:
@@ -128,7 +139,7 @@ def blended_stiffness(
 def _through(matrix: torch.Tensor, values: torch.Tensor, images: torch.Tensor, exponent: torch.Tensor) -> torch.Tensor:
     """The function (..., 3, 3) of `matrix` that takes its ascending eigenvalues to `images`, (..., 3) both.
 
-    Newton's polynomial; where eigenvalues are nearly equal, the derivatives of `x^exponent` stand in for its differences.
+    Newton's polynomial; where eigenvalues nearly coincide, derivatives of `x^exponent` stand in for its differences.
     """
     low, middle, high = values.unbind(-1)
     f_low, f_middle, f_high = images.unbind(-1)
@@ -141,10 +152,8 @@ def _through(matrix: torch.Tensor, values: torch.Tensor, images: torch.Tensor, e
         0.5 * exponent * (exponent - 1.0) * middle.pow(exponent - 2.0),
         (second - first) / torch.where(close, torch.ones_like(gap), gap),
     )
-    eye = _EYE.to(matrix)
-    from_low, from_middle = matrix - low[..., None, None] * eye, matrix - middle[..., None, None] * eye
-    slope = first[..., None, None] * eye + third[..., None, None] * from_middle
-    return f_low[..., None, None] * eye + from_low @ slope
+    slope = _plus(third[..., None, None] * matrix, first - third * middle)
+    return _plus(_plus(matrix, -low) @ slope, f_low)
 
 
 def _divided(

@@ -299,6 +299,7 @@ class H1Env(VecEnv):
         s = self.state
         self.commands.step(self.rng, leaning(s.projected_gravity_t, s.torso_angular_velocity_t))
         self._follow_path()
+        self.upper_body.step(self.dt, self.rng)
         self.hand_forces.step(self.rng)
 
         fell = fallen(self.cfg.terminations, self.state.height, self.state.projected_gravity_t) | bad
@@ -456,6 +457,7 @@ class H1Env(VecEnv):
             last_action=self._last_action,
             joint_acceleration=(s.joint_vel - velocity_before) / self.dt,
             torque=self.joint_torque(s),
+            arm_target=self.targets.current[:, self.num_lower :],
             desired_contact=desired_contact(command.phase, command.stand, num_feet),
             swing=swing_progress(command.phase, num_feet),
             key_points_t=points,
@@ -540,9 +542,17 @@ class H1Env(VecEnv):
             "/episode/time_outs_per_s": time_out.float().mean() / self.dt,
             "/episode/diverged": torch.tensor(float(self.num_diverged)),
             "/curriculum/hand_force": self.hand_forces.scale.mean(),
-            **self.upper_body.log,
+            **self._law_log(r),
             "/curriculum/assist": torch.tensor(self.assistance.share(self.samples)),
         }
+
+    def _law_log(self, r: StepRecord) -> dict[str, torch.Tensor]:
+        """What the arms' laws report, and the share of arm joints that are at their torque limit."""
+        if not self.upper_body.active:
+            return {}
+        arms = slice(self.num_lower, None)
+        at_limit = (r.torque[:, arms].abs() > 0.999 * self._torque_limit[arms]).float().mean()
+        return self.upper_body.log | {"/law/saturated": at_limit}
 
     def _finish(self, done: torch.Tensor, fell: torch.Tensor) -> None:
         if self.assistance.share(self.samples) > 0.0:
@@ -557,7 +567,7 @@ class H1Env(VecEnv):
         self._kp, self._kd = self.randomizer.gains()
         self.commands.reset(mask, self.rng)
         self.motions.reset(mask, self.rng)
-        self.upper_body.reset(mask)
+        self.upper_body.reset(mask, self.rng)
         self.hand_forces.reset(mask, self.rng)
         self.scripted.reset(mask, self.rng)
         joints = self._default + uniform(self.rng, -0.05, 0.05, n, self.num_actions)

@@ -32,6 +32,8 @@ class StepRecord:
     """(N, J) mean over the step [rad/s^2]."""
     torque: torch.Tensor
     """(N, J) joint torques at the end of the step [Nm]."""
+    arm_target: torch.Tensor
+    """(N, U) joint targets that this step's action sent to the arms [rad]."""
     desired_contact: torch.Tensor
     """(N, F) bool."""
     swing: torch.Tensor
@@ -104,6 +106,7 @@ class UpperRewards:
     upper_acceleration: float = -1e-7
     upper_action_rate: float = -0.02
     upper_joint_limits: float = -5.0
+    stay_close: float = 0.0
     alive: float = 0.1
     fall: float = -0.5
 
@@ -300,6 +303,11 @@ def upper_action_rate(s: StepRecord) -> torch.Tensor:
     return (s.action - s.last_action)[:, s.num_lower :].square().sum(1)
 
 
+def stay_close(s: StepRecord) -> torch.Tensor:
+    """Closeness of the arms' joint targets to their reference (paper, section III-D); for distillation."""
+    return torch.exp(-2.0 * (s.arm_target - s.reference.position).norm(dim=1))
+
+
 def upper_joint_limits(s: StepRecord) -> torch.Tensor:
     """By how much arm joints exceed their soft limits [rad]."""
     return _limit_excess(s, slice(s.num_lower, None))
@@ -348,6 +356,7 @@ TERMS: dict[str, Callable[[StepRecord], torch.Tensor]] = {
         upper_acceleration,
         upper_action_rate,
         upper_joint_limits,
+        stay_close,
     )
 }
 """Every term, by the name of its weight."""

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 
-from cotap.checks import require_one_of, require_range
+from cotap.checks import require_interval, require_one_of, require_range
 from cotap.compliance.laws import LAWS, Arms, ArmState, LawConfig, LawParameters, TorqueLaw
 from cotap.compliance.torso import chain_compliance, hand_base_compliance, torso_compliance
-from cotap.envs.persistence import Stateful
+from cotap.envs.persistence import Stateful, uniform
 from cotap.envs.state import RobotState
 from cotap.robots import RobotSpec
 from cotap.robots.chains import arm_chains, arm_gains, arm_inertias, chains_between
@@ -35,18 +36,46 @@ class TorsoComplianceConfig:
 
 
 @dataclass
+class LawSampling:
+    """Parameters of laws drawn at random, per world and arm, at every episode and again within it."""
+
+    enabled: bool = False
+    """Whether they are drawn; otherwise they stay as the laws' configs have them."""
+    stiffness: tuple[float, float] = (80.0, 1200.0)
+    """Hand stiffness, each axis by itself, log-uniform [N/m]."""
+    null_stiffness: tuple[float, float] = (24.0, 56.0)
+    """Uniform [Nm/rad]."""
+    alpha: tuple[float, float] = (0.0, 1.0)
+    """Uniform."""
+    hold_s: tuple[float, float] = (2.0, 6.0)
+    """Time between changes [s]."""
+
+    def check(self) -> None:
+        """Raise ValueError naming the first field that is out of its range."""
+        for name in ("stiffness", "null_stiffness", "alpha", "hold_s"):
+            require_interval(f"upper_body.sampling.{name}", getattr(self, name))
+        require_range("upper_body.sampling.stiffness[0]", self.stiffness[0], 1.0, 1e5)
+        require_range("upper_body.sampling.null_stiffness[0]", self.null_stiffness[0], 0.1, 1e4)
+        for i, value in enumerate(self.alpha):
+            require_range(f"upper_body.sampling.alpha[{i}]", value, 0.0, 1.0)
+        require_range("upper_body.sampling.hold_s[0]", self.hold_s[0], 0.02, 1e6)
+
+
+@dataclass
 class UpperBodyConfig:
     """Which law drives which arm."""
 
     left: LawConfig = field(default_factory=LawConfig)
     right: LawConfig = field(default_factory=LawConfig)
     torso: TorsoComplianceConfig = field(default_factory=TorsoComplianceConfig)
+    sampling: LawSampling = field(default_factory=LawSampling)
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
         self.left.check("upper_body.left")
         self.right.check("upper_body.right")
         self.torso.check()
+        self.sampling.check()
 
     def of(self, side: str) -> LawConfig:
         """The law of the arm on `side`."""
@@ -60,7 +89,7 @@ class UpperBody(Stateful):
     mixed with the one before it by the time that each holds, as with PD targets.
     """
 
-    STATE = ("fresh", "_anchor", "_feedforward", "_elastic", "_stiffness", "_damping")
+    STATE = ("fresh", "_hold_s", "_anchor", "_feedforward", "_elastic", "_stiffness", "_damping")
 
     def __init__(self, cfg: UpperBodyConfig, spec: RobotSpec, num_envs: int) -> None:
         cfg.check()
@@ -86,13 +115,33 @@ class UpperBody(Stateful):
         # Two torque laws, the one in force and the one before it: (2, N, A, n[, n]).
         self._anchor, self._feedforward, self._elastic = (torch.zeros(2, n, a, j) for _ in range(3))
         self._stiffness, self._damping = (torch.zeros(2, n, a, j, j) for _ in range(2))
+        self._hold_s = torch.zeros(n)
         self._torso = _TorsoModel(cfg.torso, spec)
         self.log: dict[str, torch.Tensor] = {}
         """Means over worlds and arms of what the laws report about the last step."""
 
-    def reset(self, mask: torch.Tensor) -> None:
-        """The next command of the worlds in `mask` has none before it."""
+    def reset(self, mask: torch.Tensor, rng: torch.Generator) -> None:
+        """The next command of the worlds in `mask` has none before it; their parameters are drawn anew."""
         self.fresh = self.fresh | mask
+        if self.active and self._cfg.sampling.enabled:
+            self._sample(mask, rng)
+
+    def step(self, dt: float, rng: torch.Generator) -> None:
+        """Advance the clock of the parameters by one control step."""
+        if self.active and self._cfg.sampling.enabled:
+            self._hold_s = self._hold_s - dt
+            self._sample(self._hold_s <= 0.0, rng)
+
+    def _sample(self, mask: torch.Tensor, rng: torch.Generator) -> None:
+        n, arms = int(mask.sum()), self._shape[1]
+        if n == 0:
+            return
+        cfg, p = self._cfg.sampling, self.parameters
+        low, high = (math.log(bound) for bound in cfg.stiffness)
+        p.stiffness[mask] = uniform(rng, low, high, n, arms, 3).exp()
+        p.null_stiffness[mask] = uniform(rng, *cfg.null_stiffness, n, arms)
+        p.alpha[mask] = uniform(rng, *cfg.alpha, n, arms)
+        self._hold_s[mask] = uniform(rng, *cfg.hold_s, n)
 
     def send(self, state: RobotState, target: torch.Tensor) -> None:
         """Ask the laws, for targets (N, U) sent at the start of a control step."""
@@ -104,7 +153,7 @@ class UpperBody(Stateful):
         arms = ArmState(q, dq, wanted, state.arms, to_heading, base)
         new, self.log = self._ask(arms)
         tensors = (new.anchor, new.feedforward, new.elastic, new.stiffness, new.damping)
-        for name, value in zip(self.STATE[1:], tensors, strict=True):
+        for name, value in zip(self.STATE[2:], tensors, strict=True):
             held: torch.Tensor = getattr(self, name)
             before = torch.where(self.fresh.reshape(-1, *[1] * (value.dim() - 1)), value, held[1])
             setattr(self, name, torch.stack((before, value)))

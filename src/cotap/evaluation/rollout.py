@@ -34,8 +34,14 @@ class Trajectory:
     """(T, N, 2) horizontal position of the torso in the world [m]."""
     arm_error: torch.Tensor
     """(T, N, U) arm joint angles minus reference [rad]."""
+    arm_velocity: torch.Tensor
+    """(T, N, U) arm joint rates [rad/s]."""
     arm_torque: torch.Tensor
     """(T, N, U) [Nm]."""
+    arm_at_limit: torch.Tensor
+    """(T, N) bool: an arm joint is at its torque limit."""
+    hand_position: torch.Tensor
+    """(T, N, H, 3) hands relative to the torso, heading frame [m]."""
     hand_error: torch.Tensor
     """(T, N, H) distance of the hands from their reference in the torso frame [m]."""
     foot_contact: torch.Tensor
@@ -54,12 +60,18 @@ class Trajectory:
         return self.fell.cumsum(0) == 0
 
 
-def record_rollout(env: H1Env, policy: PolicyFunction, steps: int, progress: bool = True) -> Trajectory:
-    """Run `policy` for `steps` control steps from a fresh start of every world."""
+def record_rollout(
+    env: H1Env, policy: PolicyFunction, steps: int, progress: bool = True, arm_actions: bool = True
+) -> Trajectory:
+    """Run `policy` for `steps` control steps from a fresh start of every world, with or without its arm actions."""
     obs = env.reset()
     rows: dict[str, list[torch.Tensor]] = {f.name: [] for f in fields(Trajectory) if f.name != "dt"}
     for _ in tqdm(range(steps), desc="rollout", unit="step", disable=not progress, leave=False):
-        obs, _, _, extras = env.step(policy(as_dict(obs)))
+        action = policy(as_dict(obs))
+        if not arm_actions:
+            action = action.clone()
+            action[:, env.action_slices["upper"]] = 0.0
+        obs, _, _, extras = env.step(action)
         for name, value in _row(env, extras["falls"]).items():
             rows[name].append(value)
     return Trajectory(dt=env.dt, **{name: torch.stack(values) for name, values in rows.items()})
@@ -76,7 +88,10 @@ def _row(env: H1Env, fell: torch.Tensor) -> dict[str, torch.Tensor]:
         "height_command": r.command.height,
         "position": s.torso_pos_w[:, :2],
         "arm_error": s.joint_pos[:, upper] - r.reference.position,
+        "arm_velocity": s.joint_vel[:, upper],
         "arm_torque": r.torque[:, upper],
+        "arm_at_limit": (r.torque[:, upper].abs() > 0.999 * env.arm_limits.flatten()).any(1),
+        "hand_position": s.arms.tip @ (s.heading_w.transpose(1, 2) @ s.torso_rotation_w).transpose(1, 2),
         "hand_error": (r.key_points_t - r.key_points_reference_t)[:, :hands].norm(dim=2),
         "foot_contact": s.foot_contact,
         "foot_speed": s.foot_velocity_w[:, :, :2].norm(dim=2),

@@ -130,7 +130,8 @@ def measure(env: H1Env, protocol: StaticStiffness, policy: PolicyFunction | None
             s = env.state
             rotation = s.heading_w.transpose(1, 2) @ s.torso_rotation_w
             condition = condition_number(env.reader.arm_chains.jacobian(s.arms)[:, side])
-    assert rotation is not None and condition is not None
+    assert rotation is not None
+    assert condition is not None
     moved = (rotation @ (averages[1] - averages[0]).unsqueeze(-1)).squeeze(-1)
     limit = env.arm_limits[side]
     torque = env.record.torque[:, env.action_slices["upper"]].unflatten(1, (len(env.spec.arms), -1))[:, side]

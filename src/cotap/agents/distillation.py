@@ -1,0 +1,81 @@
+"""Guidance of a new policy by a frozen one (paper, section III-D): a KL penalty that fades to nothing."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from cotap.agents.actors import DualActorCritic, Observations
+from cotap.agents.losses import gaussian_kl
+from cotap.checks import require_one_of, require_range
+
+
+@dataclass
+class DistillationConfig:
+    """How strongly, how long and whom the frozen policy guides."""
+
+    beta: float = 0.5
+    """Weight of `KL(new || base)` at the start."""
+    end_iterations: int = 300
+    """Iterations in which the weight falls linearly to zero."""
+    agents: tuple[str, ...] = ("lower",)
+    """Agents that are guided."""
+
+    def check(self) -> None:
+        """Raise ValueError naming the first field that is out of its range."""
+        require_range("distillation.beta", self.beta, 0.0, 1e3)
+        require_range("distillation.end_iterations", self.end_iterations, 1, 10**9)
+        for name in self.agents:
+            require_one_of("distillation.agents", name, ("lower", "upper"))
+
+
+class Guide:
+    """A frozen policy, and how much it still has to say.
+
+    Args:
+        base: The policy; copied, and never changed.
+        cfg: Weight and schedule.
+    """
+
+    def __init__(self, base: DualActorCritic, cfg: DistillationConfig) -> None:
+        cfg.check()
+        self.cfg = cfg
+        self.model = copy.deepcopy(base).eval()
+        for parameter in self.model.parameters():
+            parameter.requires_grad_(False)
+        self._fingerprint = self.fingerprint()
+
+    def fingerprint(self) -> float:
+        """A number that any change of the frozen policy changes."""
+        state = sorted(self.model.state_dict().items())
+        return float(sum((i + 1) * value.double().abs().sum() for i, (_, value) in enumerate(state)))
+
+    def verify(self) -> None:
+        """Raise RuntimeError if the frozen policy is no longer what it was."""
+        if self.fingerprint() != self._fingerprint:
+            raise RuntimeError("the frozen base policy has changed during training")
+
+    def beta(self, iteration: int) -> float:
+        """Weight of the penalty in this iteration, counted from 0."""
+        return self.cfg.beta * max(0.0, 1.0 - iteration / self.cfg.end_iterations)
+
+    @torch.no_grad()
+    def mean_action(self, observations: Observations) -> torch.Tensor:
+        """What the frozen policy would do (N, A), for raw observations."""
+        return self.model(observations)
+
+    def kl(self, name: str, mean: torch.Tensor, log_std: torch.Tensor, base_mean: torch.Tensor) -> torch.Tensor:
+        """Mean `KL(new || base)` of one agent's actions [nat], analytic for diagonal Gaussians."""
+        return gaussian_kl(mean, log_std, base_mean, self.model.log_std[name]).mean()
+
+    def state_dict(self) -> dict[str, Any]:
+        """The frozen policy's weights, so that a run goes on without the file it began from."""
+        return self.model.state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take over what `state_dict` returned."""
+        self.model.load_state_dict(state)
+        self._fingerprint = self.fingerprint()

@@ -1,0 +1,66 @@
+"""`python -m cotap.motions`, end to end."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from test_formats import write_amass, write_lafan
+
+from cotap.evaluation.render import RenderingUnavailable
+from cotap.motions import MotionLibrary
+from cotap.motions import show as show_module
+from cotap.motions.__main__ import main
+
+
+def test_import_writes_a_library_and_a_table(tmp_path: Path, spec, capsys):
+    write_lafan(tmp_path / "walk.csv")
+    write_amass(tmp_path / "dance.npz", spec)
+    (tmp_path / "bad.csv").write_text("1,2\n")
+    out = tmp_path / "deep" / "mine.npz"
+    assert main(["import", str(tmp_path), "--output", str(out), "--mirror", "--licence", "my own"]) == 0
+    text = capsys.readouterr().out
+    assert "4 clips (2 read), 0.2 minutes" in text
+    assert "1 could not be used:" in text
+    assert "bad.csv: " in text
+    library = MotionLibrary.load(out, spec)
+    assert library.names() == ["dance", "dance_mirrored", "walk", "walk_mirrored"]
+    assert {c.licence for c in library.clips} == {"my own"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["import", "nowhere", "--output", "x.npz"], "'nowhere' does not exist"),
+        (["import", ".", "--output", "x.pkl"], "--output must end in .npz"),
+        (["import", ".", "--output", "x.npz"], "no clip could be used; nothing was written"),
+        (["show", "nowhere.npz"], "'nowhere.npz' does not exist"),
+        (["show", "--clip", "moonwalk"], "no clip is called 'moonwalk'"),
+    ],
+)
+@pytest.mark.usefixtures("in_tmp_path")
+def test_bad_input_is_named_and_writes_nothing(arguments, message, capsys):
+    Path("bad.csv").write_text("1,2\n")
+    assert main(arguments) == 2
+    assert message in capsys.readouterr().err
+    assert not Path("x.npz").exists()
+
+
+def test_show_writes_a_plot_for_every_clip_and_a_sheet(tmp_path: Path, capsys):
+    assert main(["show", "--clip", "punch", "--clip", "walk", "--output", str(tmp_path / "out")]) == 0
+    said = capsys.readouterr()
+    assert "| punch | 2.12 | DeepMimic" in said.out
+    for name in ("punch", "walk"):
+        assert (tmp_path / "out" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+    sheet = tmp_path / "out" / "contact_sheet.png"
+    assert sheet.exists() or "no contact sheet" in said.err
+
+
+def test_where_nothing_renders_the_rest_is_there(tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch):
+    def refuse(*_args):
+        raise RenderingUnavailable("no OpenGL here")
+
+    monkeypatch.setattr(show_module, "_sheet", refuse)
+    assert main(["show", "--clip", "jump", "--output", str(tmp_path)]) == 0
+    assert [p.name for p in tmp_path.iterdir()] == ["jump.png"]
+    assert "no contact sheet: no OpenGL here" in capsys.readouterr().err
