@@ -27,7 +27,7 @@ def main() -> int:
     path = sys.argv[1] if len(sys.argv) > 1 else "docs/blend.png"
     turn = torch.tensor([[0.8, -0.6], [0.6, 0.8]], dtype=torch.float64)
     compliant = turn @ torch.diag(torch.tensor([1.0, 0.1], dtype=torch.float64)) @ turn.T
-    pd = turn.T @ torch.diag(torch.tensor([0.1, 1.0], dtype=torch.float64)) @ turn
+    pd = turn.T @ torch.diag(torch.tensor([1.0, 0.1], dtype=torch.float64)) @ turn
     figure, axes = plt.subplots(2, 1, figsize=(9.0, 3.9), constrained_layout=True)
     blends = (
         ("log-Euclidean: the determinant stays", modulate_stiffness),

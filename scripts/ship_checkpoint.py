@@ -13,6 +13,16 @@ from cotap.evaluation.policy import shipped_checkpoint
 EVALUATIONS = {
     "velocity-tracking": ["velocity-tracking", "--num-envs", "1024"],
     "velocity-tracking.hand-forces": ["velocity-tracking", "--num-envs", "1024", "--hand-force", "40"],
+    "velocity-tracking.held-out": [
+        "velocity-tracking",
+        "--num-envs",
+        "512",
+        "--motion",
+        "dance_b",
+        "dance_b_mirrored",
+        "kick",
+        "kick_mirrored",
+    ],
     "velocity-tracking.small": ["velocity-tracking", "--num-envs", "64", "--episode-seconds", "10", "--threads", "1"],
 }
 

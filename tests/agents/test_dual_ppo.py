@@ -448,7 +448,7 @@ def test_mirroring_replaces_the_first_share_of_a_batch_by_hand():
 
 def test_normalisers_see_both_sides():
     """So that the mirror image of a normalised observation is the normalised mirror image."""
-    learner = symmetric_learner(normalizer_stride=1)
+    learner = symmetric_learner(normalizer_stride=1, mirrored_share=0.5)
     collect(learner)
     x = random_observations(5, torch.Generator().manual_seed(7))
     for group, reflection in dummy_symmetry().observations.items():

@@ -150,7 +150,7 @@ def test_a_robot_told_to_stand_slows_down_and_ends_its_step(rng):
 
 
 def test_a_standing_robot_that_leans_steps_until_it_is_steady(rng):
-    commands = source(1, stand_probability=1.0, height_offset=(-0.2, -0.2))
+    commands = source(1, stand_probability=1.0, height_offset=(-0.2, -0.2), steady_rad=0.4)
     commands.override(torch.zeros(1, 2), torch.zeros(1), torch.ones(1), torch.tensor([NOMINAL - 0.2]))
     commands.reset(everyone(1), rng)
     for _ in range(60):

@@ -70,11 +70,11 @@ def test_never_beyond_the_torque_share(rng):
 
 
 def test_curriculum_rises_with_lasting_episodes_and_falls_with_falls():
-    hands = forces(4, curriculum_start=0.5, curriculum_step=0.1)
+    hands = forces(4, curriculum_start=0.5, curriculum_step=0.1, curriculum_back=0.2)
     lasted = torch.tensor([True, False, False, False])
     fell_early = torch.tensor([False, True, False, False])
     hands.finish_episodes(lasted, fell_early)
-    torch.testing.assert_close(hands.scale, torch.tensor([0.6, 0.4, 0.5, 0.5]))
+    torch.testing.assert_close(hands.scale, torch.tensor([0.6, 0.3, 0.5, 0.5]))
     for _ in range(20):
         hands.finish_episodes(lasted, fell_early)
     torch.testing.assert_close(hands.scale, torch.tensor([1.0, 0.0, 0.5, 0.5]))

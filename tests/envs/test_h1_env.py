@@ -459,10 +459,10 @@ def test_falling_and_lasting_move_the_force_curriculum(make_env):
     env = make_env(2, terminations=TerminationConfig(episode_s=0.2), hand_forces=HandForceConfig(curriculum_start=0.5))
     knock_over(env, 1)
     env.step(torch.zeros(2, 19))
-    torch.testing.assert_close(env.hand_forces.scale, torch.tensor([0.5, 0.35]))
+    torch.testing.assert_close(env.hand_forces.scale, torch.tensor([0.5, 0.3]))
     for _ in range(9):
         env.step(torch.zeros(2, 19))
-    torch.testing.assert_close(env.hand_forces.scale, torch.tensor([0.65, 0.35]))
+    torch.testing.assert_close(env.hand_forces.scale, torch.tensor([0.55, 0.3]))
 
 
 def test_log_measures_the_slope_of_measured_against_commanded(make_env):

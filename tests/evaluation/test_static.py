@@ -23,25 +23,36 @@ POSES = [
 
 
 def run(pose, stiffness, force, **laws):
-    protocol = StaticStiffness(force=force, levels=2, arm_pose=pose, settle_seconds=5.0)
+    protocol = StaticStiffness(force=force, levels=2, arm_pose=pose, settle_seconds=12.0)
     cfg = protocol.configure(H1EnvConfig(num_threads=1))
     cfg.upper_body = LawOptions(method="cotap", stiffness=(stiffness,), **laws).configure()
     return measure(H1Env(cfg), protocol, None)
 
 
+STIFFNESSES = (100.0, 300.0, 500.0, 800.0, 1000.0)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("error", "allowed"), [("joint", 0.05), ("task", 0.01)])
-@pytest.mark.parametrize("stiffness", [100.0, 300.0, 500.0, 800.0, 1000.0])
 @pytest.mark.parametrize("pose", POSES)
-def test_effective_stiffness_is_the_commanded_one(pose, stiffness, error, allowed):
-    """Loads that move the hand by 5 mm."""
-    for axis in range(3):
-        force = [0.0, 0.0, 0.0]
-        force[axis] = 0.005 * stiffness
-        result = run(pose, stiffness, tuple(force), error=error)
-        assert result.condition <= 5.0
-        assert not result.saturated
-        assert result.effective_stiffness()[axis] == pytest.approx(stiffness, rel=allowed)
+def test_effective_stiffness_is_the_commanded_one(pose, error, allowed):
+    """Every stiffness along every axis, in worlds of their own, under loads that move the hand by 5 mm."""
+    cases = [(axis, k) for axis in range(3) for k in STIFFNESSES]
+    # World 0 has no load; world i has its own, which `measure` scales by i / 15.
+    protocol = StaticStiffness(force=(1.0, 1.0, 1.0), levels=16, arm_pose=pose, settle_seconds=12.0)
+    cfg = protocol.configure(H1EnvConfig(num_threads=1))
+    cfg.upper_body = LawOptions(method="cotap", error=error).configure()
+    env = H1Env(cfg)
+    env.scripted.amplitude_h[:] = 0.0
+    for i, (axis, k) in enumerate(cases, start=1):
+        env.scripted.amplitude_h[i, 0, axis] = 0.005 * k * 15.0 / i
+        env.upper_body.parameters.stiffness[i] = k
+    result = measure(env, protocol, None)
+    assert result.condition <= 5.0
+    assert not result.saturated
+    for i, (axis, k) in enumerate(cases, start=1):
+        felt = 0.005 * k / float(result.displacement[i, axis])
+        assert felt == pytest.approx(k, rel=allowed), (axis, k)
 
 
 @pytest.mark.parametrize(("error", "allowed"), [("joint", 0.05), ("task", 0.01)])

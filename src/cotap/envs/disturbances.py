@@ -30,15 +30,17 @@ class HandForceConfig:
     """Forces are scaled down to what this share of the arm's torque limits can hold."""
     curriculum_start: float = 0.0
     """Share of the force with which worlds begin."""
-    curriculum_step: float = 0.15
-    """Change of a world's share after an episode: up when it lasted, down when the robot fell early."""
+    curriculum_step: float = 0.05
+    """What is added to a world's share after an episode that lasted."""
+    curriculum_back: float = 0.2
+    """What is taken off after an early fall: more, so that the share settles where falls are few."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
         for name in ("force_x", "force_y", "force_z", "hold_s"):
             require_interval(f"hand_forces.{name}", getattr(self, name))
         require_range("hand_forces.hold_s[0]", self.hold_s[0], 0.02, 1e6)
-        for name in ("zero_probability", "torque_share", "curriculum_start", "curriculum_step"):
+        for name in ("zero_probability", "torque_share", "curriculum_start", "curriculum_step", "curriculum_back"):
             require_range(f"hand_forces.{name}", getattr(self, name), 0.0, 1.0)
 
 
@@ -56,7 +58,7 @@ class HandForces(Stateful):
 
     def finish_episodes(self, lasted: torch.Tensor, fell_early: torch.Tensor) -> None:
         """Adapt the curriculum of worlds whose episode ended; both masks (num_envs,) bool."""
-        step = self.cfg.curriculum_step * (lasted.float() - fell_early.float())
+        step = self.cfg.curriculum_step * lasted.float() - self.cfg.curriculum_back * fell_early.float()
         self.scale = (self.scale + step).clamp(0.0, 1.0)
 
     def reset(self, mask: torch.Tensor, rng: torch.Generator) -> None:

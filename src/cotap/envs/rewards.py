@@ -75,9 +75,9 @@ class LowerRewards:
     track_height: float = 0.75
     track_height_widely: float = 0.4
     balance: float = 0.75
-    upright: float = -3.0
-    vertical_velocity: float = -0.5
-    roll_pitch_rate: float = -0.05
+    upright: float = -15.0
+    vertical_velocity: float = -1.0
+    roll_pitch_rate: float = -0.3
     contact_schedule: float = 1.0
     swing_height: float = -15.0
     foot_slip: float = -0.3

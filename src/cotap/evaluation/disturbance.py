@@ -45,6 +45,8 @@ class Impact:
     """What is measured, from the onset [s]."""
     motion: tuple[str, ...] = ()
     """Clips that the arms follow; empty holds the default pose."""
+    steady_rad: float = 0.4
+    """A standing robot that is leaning further than this, or is about to, steps in place until it is steady [rad]."""
     arm_actions: bool = True
     """Let the policy's own residual move the arms."""
     randomize: bool = True
@@ -60,6 +62,7 @@ class Impact:
         require_range("onset", self.onset, 1.0, 3600.0)
         require_range("window[0]", self.window[0], 0.0, 3600.0)
         require_range("window[1]", self.window[1], self.window[0] + 0.02, 3600.0)
+        require_range("steady_rad", self.steady_rad, 0.0, 10.0)
         require_range("torque_limit_scale", self.torque_limit_scale, 1e-3, 1e6)
         self._profile().check()
 
@@ -78,7 +81,7 @@ class Impact:
         env.assist.enabled = env.hand_forces.enabled = env.observations.noise.enabled = False
         env.randomization.enabled = self.randomize
         env.terminations.episode_s = 1e6
-        env.impedance.share = 0.0
+        env.impedance.share, env.commands.steady_rad = 0.0, self.steady_rad
         env.force = self._profile()
         clips = env.motions.clips
         clips.share, clips.only, clips.held_out = (1.0, self.motion, ()) if self.motion else (0.0, (), ())

@@ -40,6 +40,8 @@ class VelocityTracking:
     """Reference arm motion; otherwise arms hold their default pose."""
     motion: tuple[str, ...] = ()
     """Arms follow these clips only; empty keeps the mixture that the policy was trained on."""
+    steady_rad: float = 0.4
+    """A standing robot that is leaning further than this, or is about to, steps in place until it is steady [rad]."""
     follow_path: bool = False
     """Lead the torso along the clips' root path instead of drawing velocity commands."""
     torque_limit_scale: float = 1.0
@@ -55,6 +57,7 @@ class VelocityTracking:
             require_range(name, getattr(self, name), 0.0, 5.0)
         require_range("height_drop", self.height_drop, 0.0, 0.5)
         require_range("stand_probability", self.stand_probability, 0.0, 1.0)
+        require_range("steady_rad", self.steady_rad, 0.0, 10.0)
         require_range("hand_force", self.hand_force, 0.0, 1000.0)
         require_range("torque_limit_scale", self.torque_limit_scale, 1e-3, 1e3)
 
@@ -70,6 +73,7 @@ class VelocityTracking:
         if self.motion:
             clips = env.motions.clips
             clips.share, clips.only, clips.held_out = 1.0, self.motion, ()
+        env.commands.steady_rad = self.steady_rad
         env.impedance.share = float(self.follow_path)
         c = env.commands
         c.velocity_x, c.velocity_y = (-self.speed_x, self.speed_x), (-self.speed_y, self.speed_y)
@@ -79,5 +83,6 @@ class VelocityTracking:
         f = env.hand_forces
         f.enabled = self.hand_force > 0.0
         f.force_x = f.force_y = f.force_z = (-self.hand_force, self.hand_force)
-        f.zero_probability, f.curriculum_start, f.curriculum_step = 0.0, 1.0, 0.0
+        f.zero_probability, f.curriculum_start = 0.0, 1.0
+        f.curriculum_step = f.curriculum_back = 0.0
         return env

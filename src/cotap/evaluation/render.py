@@ -92,7 +92,7 @@ def record_tour(cfg: H1EnvConfig, policy: PolicyFunction, seed: int = 0) -> tupl
     """One nominal robot on the tour. Returns the environment and its `qpos` (T, nq) at every control step."""
     cfg.num_envs, cfg.seed = 1, seed
     cfg.randomization.enabled = cfg.hand_forces.enabled = cfg.assist.enabled = False
-    cfg.terminations.episode_s = 1e4
+    cfg.terminations.episode_s, cfg.commands.steady_rad = 1e4, 0.4
     env = H1Env(cfg)
     rows: list[torch.Tensor] = []
     nominal = env.spec.nominal_height_m

@@ -35,7 +35,7 @@ class StaticStiffness:
     """Number of loads, from zero to full."""
     repeats: int = 1
     """Worlds per load."""
-    settle_seconds: float = 6.0
+    settle_seconds: float = 10.0
     """How long a load is left to settle [s]; the last second is measured."""
     arm_actions: bool = False
     """Let the policy's own residual move the arms (pelvis free)."""
@@ -73,6 +73,7 @@ class StaticStiffness:
         env.fixed_base = self.pelvis == "fixed"
         env.motions.clips.share = 0.0
         env.terminations.episode_s = 1e6
+        env.commands.steady_rad = 0.4
         env.commands.stand_probability, env.commands.height_offset = 1.0, (0.0, 0.0)
         env.force.force, env.force.hand, env.force.start_s = self.force, self.hand, self.settle_seconds
         return env
