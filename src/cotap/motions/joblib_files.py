@@ -151,5 +151,9 @@ def load_joblib(path: Path) -> Any:
         raise MotionError(f"{str(path)!r} {error}") from error
     except FileNotFoundError as error:
         raise MotionError(f"motion file {str(path)!r} does not exist") from error
-    except Exception as error:  # a hostile pickle can make the unpickler raise anything
+    except PermissionError as error:
+        raise MotionError(f"motion file {str(path)!r} cannot be read: {error}") from error
+    except (
+        Exception
+    ) as error:  # opcodes of a hostile file run into whatever their operands lack; one bad file is reported
         raise MotionError(f"{str(path)!r} is damaged or no joblib file: {type(error).__name__}: {error}") from error
