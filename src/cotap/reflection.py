@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 
@@ -21,9 +22,23 @@ class Reflection:
         """The mirror image of `x` (..., W)."""
         return x.index_select(-1, self.index) * self.sign.to(x.dtype)
 
-    def to(self, device: str) -> Reflection:
+    def to(self, device: torch.device | str) -> Reflection:
         """The same on another device."""
         return Reflection(self.index.to(device), self.sign.to(device))
+
+    def part(self, columns: slice) -> Reflection:
+        """The reflection of these columns alone, which must hold each other's images."""
+        return Reflection(self.index[columns] - columns.start, self.sign[columns])
+
+
+def join(parts: Sequence[Reflection]) -> Reflection:
+    """The reflection of a concatenation."""
+    index: list[torch.Tensor] = []
+    start = 0
+    for part in parts:
+        index.append(part.index + start)
+        start += part.index.numel()
+    return Reflection(torch.cat(index), torch.cat([p.sign for p in parts]))
 
 
 @dataclass(frozen=True)
@@ -33,6 +48,22 @@ class Symmetry:
     observations: Mapping[str, Reflection]
     actions: Reflection
 
-    def to(self, device: str) -> Symmetry:
-        """The same on another device."""
-        return Symmetry({k: v.to(device) for k, v in self.observations.items()}, self.actions.to(device))
+    def to_plain(self) -> dict[str, Any]:
+        """As plain data, for checkpoints."""
+        return {
+            "observations": {k: _to_lists(v) for k, v in self.observations.items()},
+            "actions": _to_lists(self.actions),
+        }
+
+    @classmethod
+    def from_plain(cls, plain: dict[str, Any]) -> Symmetry:
+        """What `to_plain` gave."""
+        return cls({k: _from_lists(v) for k, v in plain["observations"].items()}, _from_lists(plain["actions"]))
+
+
+def _to_lists(reflection: Reflection) -> list[list[int]]:
+    return [reflection.index.tolist(), reflection.sign.int().tolist()]
+
+
+def _from_lists(lists: list[list[int]]) -> Reflection:
+    return Reflection(torch.tensor(lists[0]), torch.tensor(lists[1], dtype=torch.float32))

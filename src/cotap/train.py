@@ -218,7 +218,7 @@ def _guide(env: Any, options: DistillOptions, base: dict[str, Any] | None) -> An
     from cotap.agents.runner import layout_of
 
     training = options.training
-    model = DualActorCritic(layout_of(env), training.ppo.hidden, training.ppo.initial_std)
+    model = DualActorCritic(layout_of(env, training.ppo.symmetric), training.ppo.hidden, training.ppo.initial_std)
     if base is not None:
         require_layout(options.base_checkpoint, base["layout"], json.loads(json.dumps(env.layout())))
         try:

@@ -15,7 +15,6 @@ from cotap.agents.actors import AgentLayout, Observations, as_dict
 from cotap.agents.dual_ppo import DualPPO, DualPPOConfig
 from cotap.agents.precision import resolve_precision
 from cotap.agents.runner import layout_of
-from cotap.reflection import Reflection, Symmetry
 
 AGENTS = ("lower", "upper")
 SLICES = {"lower": slice(0, 3), "upper": slice(3, 5)}
@@ -366,6 +365,7 @@ def test_layout_learns_sizes_from_the_environment():
         "observation_widths": {"policy": 6, "privileged": 2},
         "obs_groups": {"actor": ["policy"], "critic": ["policy", "privileged"]},
         "action_slices": {"lower": [0, 3], "upper": [3, 5]},
+        "symmetry": None,
     }
     assert isinstance(layout, AgentLayout)
 
@@ -415,56 +415,6 @@ def test_smallest_sizes_that_are_allowed_learn_finite_parameters():
     assert all(bool(p.isfinite().all()) for p in learner.model.parameters())
 
 
-def dummy_symmetry() -> Symmetry:
-    """Actions 0 and 1 change places, the others change sign; observations in reverse order, or with another sign."""
-    return Symmetry(
-        {
-            "policy": Reflection(torch.arange(5, -1, -1), torch.ones(6)),
-            "privileged": Reflection(torch.tensor([0, 1]), torch.tensor([-1.0, 1.0])),
-        },
-        Reflection(torch.tensor([1, 0, 2, 3, 4]), torch.tensor([1.0, 1.0, -1.0, -1.0, -1.0])),
-    )
-
-
-def symmetric_learner(**ppo: Any) -> DualPPO:
-    torch.manual_seed(0)
-    return DualPPO(layout_of(DummyEnv(8)), 8, DualPPOConfig(**(TINY | ppo)), symmetry=dummy_symmetry())
-
-
-def test_mirroring_replaces_the_first_share_of_a_batch_by_hand():
-    learner = symmetric_learner(mirrored_share=0.5)
-    inputs = {"policy": torch.arange(24.0).reshape(4, 6), "privileged": torch.arange(8.0).reshape(4, 2)}
-    batch = {"actions": torch.arange(20.0).reshape(4, 5), "means": -torch.arange(20.0).reshape(4, 5),
-             "advantages": torch.arange(4.0)}  # fmt: skip
-    learner._mirror(inputs, batch)
-    assert inputs["policy"][0].tolist() == [5.0, 4.0, 3.0, 2.0, 1.0, 0.0]
-    assert inputs["policy"][2].tolist() == [12.0, 13.0, 14.0, 15.0, 16.0, 17.0]
-    assert inputs["privileged"].tolist() == [[0.0, 1.0], [-2.0, 3.0], [4.0, 5.0], [6.0, 7.0]]
-    assert batch["actions"][1].tolist() == [6.0, 5.0, -7.0, -8.0, -9.0]
-    assert batch["means"][1].tolist() == [-6.0, -5.0, 7.0, 8.0, 9.0]
-    assert batch["actions"][3].tolist() == [15.0, 16.0, 17.0, 18.0, 19.0]
-    assert batch["advantages"].tolist() == [0.0, 1.0, 2.0, 3.0]
-
-
-def test_normalisers_see_both_sides():
-    """So that the mirror image of a normalised observation is the normalised mirror image."""
-    learner = symmetric_learner(normalizer_stride=1, mirrored_share=0.5)
-    collect(learner)
-    x = random_observations(5, torch.Generator().manual_seed(7))
-    for group, reflection in dummy_symmetry().observations.items():
-        normalizer = learner.model.normalizers[group]
-        torch.testing.assert_close(normalizer(reflection(x[group])), reflection(normalizer(x[group])))
-
-
-def test_the_learning_rate_follows_what_was_collected_not_its_mirror_image():
-    """A policy far from symmetric: the distance of mirrored samples would look like a huge step."""
-    learner = symmetric_learner(mirrored_share=0.5, epochs=1, mini_batches=1)
-    with torch.no_grad():
-        learner.model.actors["lower"].mlp[-1].bias += torch.tensor([2.0, -2.0, 1.0])
-    collect(learner)
-    assert learner.update()["lower/kl"] == pytest.approx(0.0, abs=1e-6)
-
-
 def test_spread_is_limited_more_and_more():
     learner = make_learner(initial_std=0.8, std_half_life=2.0, least_std=0.3)
     largest = []
@@ -479,15 +429,3 @@ def test_spread_is_limited_more_and_more():
     again = make_learner(initial_std=0.8, std_half_life=2.0, least_std=0.3)
     again.load_state_dict(learner.state_dict())
     assert again.iterations == 5
-
-
-def test_no_symmetry_or_no_share_learns_as_before():
-    a, b = make_learner(), symmetric_learner(mirrored_share=0.0)
-    for learner in (a, b):
-        collect(learner)
-        torch.manual_seed(3)
-        learner.update()
-    assert b.symmetry is None
-    for agent in AGENTS:
-        for key, value in parameters(a, agent).items():
-            assert torch.equal(value, parameters(b, agent)[key])

@@ -173,7 +173,8 @@ def test_held_out_clips_are_never_played_and_named_ones_are(spec):
 
 
 def test_root_velocity_is_that_of_worlds_that_play_clips(spec):
-    motion = ReferenceMotion(ReferenceConfig(clips=ClipConfig(share=1.0, only=("run",))), spec, 2, DT)
+    clips = ClipConfig(share=1.0, only=("run",), velocity_share=1.0, acceleration=1e6)
+    motion = ReferenceMotion(ReferenceConfig(clips=clips), spec, 2, DT)
     rng = torch.Generator().manual_seed(0)
     motion.reset(everyone(2), rng)
     motion._from_clip = torch.tensor([True, False])

@@ -90,6 +90,8 @@ def test_arms_have_laws_of_their_own(make_env):
 
 def test_parameters_differ_between_worlds_and_change_at_any_step(make_env):
     env = make_env(2, upper_body=fresh(COTAP), randomization=RandomizationConfig(enabled=False))
+    env.motions.hold(env.motions.default)
+    env.reset()
     env.upper_body.parameters.stiffness[1] = 900.0
     drive(env, 1)
     largest = torch.linalg.eigvalsh(env.upper_body._stiffness[1])[..., -1]

@@ -6,9 +6,12 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 import torch
-from rsl_rl.modules import MLP, EmpiricalNormalization
+from rsl_rl.modules import EmpiricalNormalization
 from tensordict import TensorDict
 from torch import nn
+
+from cotap.agents.heads import Head, SymmetricHead
+from cotap.reflection import Reflection, Symmetry, join
 
 Observations = dict[str, torch.Tensor]
 
@@ -27,6 +30,8 @@ class AgentLayout:
     """Observation groups that `actor` and `critic` read."""
     action_slices: dict[str, slice]
     """Each agent's share of the action vector."""
+    symmetry: Symmetry | None = None
+    """Mirror images, for networks that are symmetric by construction; None for plain ones."""
 
     def to_plain(self) -> dict[str, Any]:
         """As plain data, for checkpoints."""
@@ -34,7 +39,18 @@ class AgentLayout:
             "observation_widths": dict(self.observation_widths),
             "obs_groups": {k: list(v) for k, v in self.obs_groups.items()},
             "action_slices": {k: [v.start, v.stop] for k, v in self.action_slices.items()},
+            "symmetry": self.symmetry.to_plain() if self.symmetry else None,
         }
+
+    @classmethod
+    def from_plain(cls, plain: dict[str, Any]) -> AgentLayout:
+        """What `to_plain` gave."""
+        return cls(
+            plain["observation_widths"],
+            plain["obs_groups"],
+            {name: slice(*bounds) for name, bounds in plain["action_slices"].items()},
+            Symmetry.from_plain(plain["symmetry"]) if plain.get("symmetry") else None,
+        )
 
     @property
     def num_actions(self) -> int:
@@ -43,24 +59,6 @@ class AgentLayout:
     def width(self, reader: str) -> int:
         """Input width of the `actor` or the `critic`."""
         return sum(self.observation_widths[g] for g in self.obs_groups[reader])
-
-
-class Head(nn.Module):
-    """An MLP whose hidden layers may run in bfloat16 and whose output layer runs in float32."""
-
-    def __init__(self, inputs: int, outputs: int, hidden: tuple[int, ...], output_gain: float) -> None:
-        super().__init__()
-        self.mlp = MLP(inputs, outputs, hidden, "swish")
-        last = cast(nn.Linear, self.mlp[-1])
-        nn.init.orthogonal_(last.weight, gain=output_gain)
-        nn.init.zeros_(last.bias)
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """(N, inputs) to (N, outputs), float32."""
-        for layer in list(self.mlp)[:-1]:
-            x = layer(x)
-        with torch.autocast(x.device.type, enabled=False):
-            return self.mlp[-1](x.float())
 
 
 class DualActorCritic(nn.Module):
@@ -74,21 +72,39 @@ class DualActorCritic(nn.Module):
             {g: EmpiricalNormalization(layout.observation_widths[g]) for g in sorted(used)}
         )
         sizes = {name: s.stop - s.start for name, s in layout.action_slices.items()}
-        self.actors = nn.ModuleDict(
-            {name: Head(layout.width("actor"), size, hidden, 0.01) for name, size in sizes.items()}
-        )
-        self.critics = nn.ModuleDict({name: Head(layout.width("critic"), 1, hidden, 1.0) for name in sizes})
+        self.actors = nn.ModuleDict({name: self._actor(name, hidden) for name in sizes})
+        self.critics = nn.ModuleDict({name: self._critic(hidden) for name in sizes})
         log_std = float(torch.tensor(initial_std).log())
         self.log_std = nn.ParameterDict({name: torch.full((size,), log_std) for name, size in sizes.items()})
+
+    def _actor(self, name: str, hidden: tuple[int, ...]) -> nn.Module:
+        part, symmetry = self.layout.action_slices[name], self.layout.symmetry
+        if symmetry is None:
+            return Head(self.layout.width("actor"), part.stop - part.start, hidden, 0.01)
+        return SymmetricHead(self._input_reflection("actor", symmetry), symmetry.actions.part(part), hidden, 0.01)
+
+    def _critic(self, hidden: tuple[int, ...]) -> nn.Module:
+        symmetry = self.layout.symmetry
+        if symmetry is None:
+            return Head(self.layout.width("critic"), 1, hidden, 1.0)
+        unchanged = Reflection(torch.tensor([0]), torch.ones(1))
+        return SymmetricHead(self._input_reflection("critic", symmetry), unchanged, hidden, 1.0)
+
+    def _input_reflection(self, reader: str, symmetry: Symmetry) -> Reflection:
+        return join([symmetry.observations[g] for g in self.layout.obs_groups[reader]])
 
     def normalize(self, observations: Observations) -> Observations:
         """Every group by its own running mean and standard deviation."""
         return {g: normalizer(observations[g]) for g, normalizer in self.normalizers.items()}
 
     def update_normalizers(self, observations: Observations) -> None:
-        """Learn from a batch of raw observations."""
+        """Learn from a batch of raw observations, and from their mirror images where the networks are symmetric:
+        a mirror image must stay one after normalisation."""
         for group, normalizer in self.normalizers.items():
-            cast(EmpiricalNormalization, normalizer).update(observations[group])
+            value = observations[group]
+            if self.layout.symmetry:
+                value = torch.cat((value, self.layout.symmetry.observations[group].to(value.device)(value)))
+            cast(EmpiricalNormalization, normalizer).update(value)
 
     def read(self, reader: str, normalized: Observations) -> torch.Tensor:
         """Input (N, width) of the `actor` or `critic`."""

@@ -22,7 +22,6 @@ from cotap.agents.losses import (
 )
 from cotap.agents.precision import PRECISIONS, resolve_precision
 from cotap.checks import require_one_of, require_positive_int, require_range
-from cotap.reflection import Symmetry
 
 
 @dataclass
@@ -63,9 +62,9 @@ class DualPPOConfig:
     """auto, bf16 or fp32."""
     normalizer_stride: int = 4
     """Observations of every so many steps update the normalisers."""
-    mirrored_share: float = 0.0
-    """Share of samples that are replaced by their left-right mirror image, where the environment tells what that is.
-    Harmful once the spread of actions is small: the policy's own asymmetry then clips most of them."""
+    symmetric: bool = True
+    """Networks that are left-right symmetric by construction, where the environment tells what that is (see
+    `cotap.agents.runner.layout_of`)."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
@@ -88,7 +87,6 @@ class DualPPOConfig:
             "max_grad_norm",
         ):
             require_range(f"ppo.{name}", getattr(self, name), 1e-8, 1e6)
-        require_range("ppo.mirrored_share", self.mirrored_share, 0.0, 0.9)
         for name in ("entropy", "value"):
             require_range(f"ppo.{name}", getattr(self, name), 0.0, 1e3)
 
@@ -117,18 +115,15 @@ class DualPPO:
         num_envs: Number of worlds.
         cfg: Hyperparameters.
         device: Where the networks live.
-        symmetry: Mirror images of observations and actions; None for a task that has no symmetry.
         guide: A frozen policy that agents are kept close to at first; None for none.
     """
 
     def __init__(
-        self, layout: AgentLayout, num_envs: int, cfg: DualPPOConfig, device: str = "cpu",
-        symmetry: Symmetry | None = None, guide: Guide | None = None,
-    ) -> None:  # fmt: skip
+        self, layout: AgentLayout, num_envs: int, cfg: DualPPOConfig, device: str = "cpu", guide: Guide | None = None
+    ) -> None:
         cfg.check()
         self.cfg, self.device, self.layout = cfg, device, layout
         self.guide = guide
-        self.symmetry = symmetry.to(device) if symmetry and cfg.mirrored_share > 0.0 else None
         self.dtype = resolve_precision(cfg.precision, device)
         self.names = tuple(layout.action_slices)
         self.model = DualActorCritic(layout, cfg.hidden, cfg.initial_std).to(device)
@@ -177,8 +172,6 @@ class DualPPO:
         t, r, model = self._step, self.rollout, self.model
         if t % self.cfg.normalizer_stride == 0:
             model.update_normalizers(observations)
-            if self.symmetry:  # a mirror image must stay one after normalisation
-                model.update_normalizers({g: self.symmetry.observations[g](observations[g]) for g in model.normalizers})
         for group, value in model.normalize(observations).items():
             r.observations[group][t] = value
         stored = {group: value[t] for group, value in r.observations.items()}
@@ -234,7 +227,6 @@ class DualPPO:
             for ids in torch.randperm(total, device=self.device).chunk(cfg.mini_batches):
                 batch = {key: value[ids] for key, value in flat.items()}
                 inputs = {g: v[ids] for g, v in observations.items()}
-                self._mirror(inputs, batch)
                 with self._autocast():
                     actor_in, critic_in = self.model.read("actor", inputs), self.model.read("critic", inputs)
                 for g, name in enumerate(self.names):
@@ -259,22 +251,6 @@ class DualPPO:
         for log_std in self.model.log_std.values():
             log_std.clamp_(max=math.log(max(largest, 1e-8)))
 
-    def _mirror(self, inputs: Observations, batch: dict[str, torch.Tensor]) -> None:
-        """Replace the first samples of a shuffled mini-batch by their mirror images, in place.
-
-        The policy that collected them is taken to be symmetric, so that log-probabilities, values and advantages stay.
-        """
-        if not self.symmetry:
-            return
-        share = slice(0, self._num_mirrored(batch))
-        for group, value in inputs.items():
-            value[share] = self.symmetry.observations[group](value[share])
-        for key in {"actions", "means", "guide_means"} & batch.keys():
-            batch[key][share] = self.symmetry.actions(batch[key][share])
-
-    def _num_mirrored(self, batch: dict[str, torch.Tensor]) -> int:
-        return int(self.cfg.mirrored_share * batch["actions"].shape[0]) if self.symmetry else 0
-
     def _update_agent(
         self, name: str, g: int, actor_in: torch.Tensor, critic_in: torch.Tensor, batch: dict[str, torch.Tensor],
         old_log_std: torch.Tensor,
@@ -286,9 +262,7 @@ class DualPPO:
             value = model.critics[name](critic_in).squeeze(-1)
         log_std = model.log_std[name]
         with torch.no_grad():
-            # Of samples as they were collected: a mirrored one's distance holds the policy's own asymmetry as well.
-            own = slice(self._num_mirrored(batch), None)
-            kl = gaussian_kl(batch["means"][own, part], old_log_std, mean[own], log_std).mean()
+            kl = gaussian_kl(batch["means"][:, part], old_log_std, mean, log_std).mean()
         self.learning_rates[name] = adapt_learning_rate(self.learning_rates[name], float(kl), cfg.desired_kl)
         log_prob = gaussian_log_prob(batch["actions"][:, part], mean, log_std)
         surrogate = clipped_surrogate(log_prob, batch["log_probs"][:, g], batch["advantages"][:, g], cfg.clip)

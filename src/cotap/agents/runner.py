@@ -41,10 +41,11 @@ class RunnerConfig:
         require_positive_int("runner.save_interval", self.save_interval)
 
 
-def layout_of(env: VecEnv) -> AgentLayout:
-    """Sizes, action slices and observation groups, asked of the environment."""
+def layout_of(env: VecEnv, symmetric: bool = True) -> AgentLayout:
+    """Sizes, action slices, observation groups and mirror images (if it has any), asked of the environment."""
     widths = {group: value.shape[-1] for group, value in env.get_observations().items()}
-    return AgentLayout(widths, env.obs_groups, env.action_slices)  # pyright: ignore[reportAttributeAccessIssue]
+    groups, slices = env.obs_groups, env.action_slices  # pyright: ignore[reportAttributeAccessIssue]
+    return AgentLayout(widths, groups, slices, getattr(env, "symmetry", None) if symmetric else None)
 
 
 def check_run_dir(run_dir: Path, resuming: bool) -> None:
@@ -86,8 +87,7 @@ class DualRunner(OnPolicyRunner):
     ) -> None:  # fmt: skip
         cfg.check()
         self.env, self.runner_cfg, self.run_dir, self.config, self.device = env, cfg, run_dir, config, device
-        symmetry = getattr(env, "symmetry", None)
-        self.alg: DualPPO = DualPPO(layout_of(env), env.num_envs, ppo, device, symmetry, guide)  # pyright: ignore
+        self.alg: DualPPO = DualPPO(layout_of(env, ppo.symmetric), env.num_envs, ppo, device, guide)  # pyright: ignore
         self.current_learning_iteration = 0
         self.wall_seconds = 0.0
         self._stop = False

@@ -20,15 +20,15 @@ PEAK_SPEED = 1.875
 class MotionConfig:
     """How often each kind of motion is drawn, and how fast it may be."""
 
-    hold: float = 0.2
+    hold: float = 0.3
     """Weight of holding the present pose."""
-    reach: float = 0.35
+    reach: float = 0.3
     """Weight of smooth moves to random poses."""
     punch: float = 0.15
     """Weight of fast out-and-back moves."""
     wave: float = 0.15
     """Weight of oscillations of random joints."""
-    swing: float = 0.15
+    swing: float = 0.1
     """Weight of both arms swinging in opposition, as in walking."""
     velocity_share: float = 0.5
     """Fastest reference, as a share of each joint's velocity limit."""

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 import torch
 
 from cotap.checks import require_interval, require_range
@@ -13,6 +14,7 @@ from cotap.envs.clips import ClipPlayer
 from cotap.envs.motions import PEAK_SPEED, ArmReference, MotionConfig, MotionGenerator, minimum_jerk
 from cotap.envs.persistence import Stateful, uniform
 from cotap.motions.library import MotionError, MotionLibrary, shipped_library
+from cotap.motions.pace import pace
 from cotap.robots import RobotSpec
 
 
@@ -28,6 +30,10 @@ class ClipConfig:
     """Play these clips; empty plays all but `held_out`."""
     held_out: tuple[str, ...] = ("dance_b", "dance_b_mirrored", "kick", "kick_mirrored")
     """Clips kept out, for evaluation. Names that a library of one's own lacks are ignored."""
+    velocity_share: float = 0.5
+    """Fastest playing, as a share of each joint's velocity limit; faster passages are slowed down."""
+    acceleration: float = 100.0
+    """Largest joint acceleration in playing [rad/s^2]; the same."""
     hold_s: tuple[float, float] = (4.0, 10.0)
     """Time before another motion is drawn [s]."""
     blend_s: float = 0.3
@@ -38,6 +44,8 @@ class ClipConfig:
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
         require_range("clips.share", self.share, 0.0, 1.0)
+        require_range("clips.velocity_share", self.velocity_share, 0.01, 1.0)
+        require_range("clips.acceleration", self.acceleration, 1.0, 1e6)
         require_interval("clips.hold_s", self.hold_s)
         require_range("clips.hold_s[0]", self.hold_s[0], 0.02, math.inf)
         require_range("clips.blend_s", self.blend_s, 0.02, 10.0)
@@ -58,14 +66,14 @@ class ReferenceConfig:
 
 
 def load_clips(cfg: ClipConfig, spec: RobotSpec) -> MotionLibrary:
-    """The clips that a config asks for. Raises MotionError for a library or a clip that is not there."""
+    """The clips that a config asks for, at its pace. Raises MotionError for a library or a clip that is not there."""
     library = MotionLibrary.load(cfg.library, spec) if cfg.library else shipped_library(spec)
-    if cfg.only:
-        return library.select(list(cfg.only), spec)
-    names = [name for name in library.names() if name not in cfg.held_out]
+    names = list(cfg.only) or [name for name in library.names() if name not in cfg.held_out]
     if not names:
         raise MotionError("clips.held_out leaves no clip to play")
-    return library.select(names, spec)
+    limit = np.array([spec.joints[i].velocity_limit_rad_s for i in spec.indices(spec.upper_joints)])
+    clips = [pace(clip, cfg.velocity_share * limit, cfg.acceleration) for clip in library.select(names, spec).clips]
+    return MotionLibrary(clips, spec)
 
 
 class ReferenceMotion(Stateful):

@@ -80,7 +80,7 @@ class LowerRewards:
     roll_pitch_rate: float = -0.3
     contact_schedule: float = 1.0
     swing_height: float = -15.0
-    foot_slip: float = -0.3
+    foot_slip: float = -1.0
     foot_flat: float = -0.3
     foot_yaw: float = -0.5
     feet_apart: float = -5.0

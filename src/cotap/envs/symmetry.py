@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from cotap.envs.observations import Term
-from cotap.reflection import Reflection
+from cotap.reflection import Reflection, join
 from cotap.robots import RobotSpec
 
 # Reflection in the x-z plane: vectors keep x and z, axial vectors (rotations) keep y.
@@ -23,15 +23,6 @@ _SIGNS: dict[str, tuple[float, ...]] = {
     "torso_orientation": (1.0, *_AXIAL),
     "torso_linear_velocity": _VECTOR,
 }
-
-
-def _join(parts: list[Reflection]) -> Reflection:
-    index: list[torch.Tensor] = []
-    start = 0
-    for part in parts:
-        index.append(part.index + start)
-        start += part.index.numel()
-    return Reflection(torch.cat(index), torch.cat([p.sign for p in parts]))
 
 
 def joint_reflection(spec: RobotSpec, joints: tuple[str, ...]) -> Reflection:
@@ -53,7 +44,7 @@ def _term_reflection(spec: RobotSpec, name: str, width: int) -> Reflection:
 
 def actor_reflection(spec: RobotSpec, terms: tuple[Term, ...], history: int) -> Reflection:
     """Of the actor's observation: `history` steps of every term, term by term."""
-    return _join([_term_reflection(spec, name, width) for name, width, _ in terms for _ in range(history)])
+    return join([_term_reflection(spec, name, width) for name, width, _ in terms for _ in range(history)])
 
 
 def critic_reflection(spec: RobotSpec, terms: tuple[Term, ...]) -> Reflection:
@@ -65,4 +56,4 @@ def critic_reflection(spec: RobotSpec, terms: tuple[Term, ...]) -> Reflection:
     hands = Reflection(
         torch.cat([3 * sides.index(swap[s]) + torch.arange(3) for s in sides]), torch.tensor(_VECTOR * len(sides))
     )
-    return _join([*parts, hands])
+    return join([*parts, hands])

@@ -48,9 +48,8 @@ def load_policy(path: Path | str) -> Policy:
         if part not in content:
             raise CheckpointError(f"checkpoint {str(path)!r} lacks its part {part!r}")
     layout, weights, agents = content["layout"], content["model"], content["agents"]
-    slices = {name: slice(*bounds) for name, bounds in agents["action_slices"].items()}
     hidden = tuple(content["config"]["training"]["ppo"]["hidden"])
-    model = DualActorCritic(AgentLayout(agents["observation_widths"], agents["obs_groups"], slices), hidden, 1.0)
+    model = DualActorCritic(AgentLayout.from_plain(agents), hidden, 1.0)
     try:
         model.load_state_dict(weights)
     except RuntimeError as error:
