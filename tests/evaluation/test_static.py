@@ -62,6 +62,28 @@ def test_one_pose_one_axis(error, allowed):
     assert result.effective_stiffness()[:2] == [None, None]
 
 
+@pytest.mark.parametrize(
+    ("error", "expected"),
+    [
+        ("joint", {100.0: -0.137, 300.0: -0.127, 500.0: -0.115, 800.0: -0.071, 1000.0: -0.054}),
+        ("task", {500.0: -0.1, 800.0: -0.0625, 1000.0: -0.05}),
+    ],
+)
+def test_heavy_load(error, expected):
+    """50 N on the left hand, 300 N/m along x and y, elbow at 0.3 rad, no torque limits: as another model of H1 gave."""
+    protocol = StaticStiffness(
+        force=(0.0, 0.0, -1.0), levels=1 + len(expected), settle_seconds=8.0, torque_limit_scale=100.0
+    )
+    cfg = protocol.configure(H1EnvConfig(num_threads=1))
+    cfg.upper_body = LawOptions(method="cotap", stiffness=(300.0,), error=error).configure()
+    env = H1Env(cfg)
+    for i, vertical in enumerate(expected, start=1):
+        env.scripted.amplitude_h[i, 0, 2] = -50.0 * len(expected) / i  # `measure` scales world i by i / worlds
+        env.upper_body.parameters.stiffness[i, ..., 2] = vertical
+    moved = measure(env, protocol, None).displacement[1:, 2]
+    assert moved.tolist() == pytest.approx(list(expected.values()), rel=0.01)
+
+
 def test_an_asked_for_table_by_axis(tmp_path, capsys):
     out = tmp_path / "static.json"
     arguments = ["static-stiffness", "--method", "cotap", "--stiffness", "200", "400", "800", "--error", "task",
