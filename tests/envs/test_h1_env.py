@@ -216,7 +216,7 @@ def stand_or_walk(env, stand: list[float], phase: list[float]) -> None:
 def test_targets_by_hand(make_env):
     action = torch.zeros(2, 19)
     action[0, 3], action[0, 11], action[1, 18] = 2.0, -3.0, 1.0
-    env = make_env(2)
+    env = make_env(2, actions=ActionConfig(stance_balance=0.0))
     stand_or_walk(env, [1.0, 1.0], [0.0, 0.0])
     env.motions.hold(torch.linspace(0.1, 0.8, 8))
     target = env.target_from_action(action)
@@ -232,7 +232,7 @@ def test_targets_by_hand(make_env):
 
 def test_the_gait_clock_lifts_the_swinging_leg(make_env):
     """Worlds: both feet down, left leg at the top of its swing (phase 0.79), right leg halfway up (0.5 + 0.685)."""
-    env = make_env(3, actions=ActionConfig(step_lift=0.5))
+    env = make_env(3, actions=ActionConfig(step_lift=0.5, stance_balance=0.0))
     stand_or_walk(env, [1.0, 0.0, 0.0], [0.0, 0.79, 0.185])
     target = env.target_from_action(torch.zeros(3, 19))
     default = torch.tensor([j.default_rad for j in env.spec.joints])

@@ -28,6 +28,7 @@ from cotap.envs.persistence import uniform
 from cotap.envs.randomization import RandomizationConfig, Randomizer
 from cotap.envs.reference import ReferenceConfig, ReferenceMotion
 from cotap.envs.rewards import LowerRewards, RewardGroup, StepRecord, UpperRewards, check_weights
+from cotap.envs.stance import StanceBalance
 from cotap.envs.state import RobotState, StateReader
 from cotap.envs.symmetry import actor_reflection, critic_reflection, joint_reflection
 from cotap.envs.terminations import TerminationConfig, diverged, fallen
@@ -53,6 +54,8 @@ class ActionConfig:
     """Share of the swinging foot's lift that the gait clock feeds forward to the legs; 0 leaves it to the policy."""
     step_stride: float = 1.0
     """Share of the feet's sweep at the commanded velocity that is fed forward; 0 leaves it to the policy."""
+    stance_balance: float = 1.0
+    """Share of the standing pose and the feedback that balances it that are fed forward; 0 leaves it to the policy."""
     upper_scale: float = 0.1
     """Radians per unit of upper action, added to the reference (residual) or to the default pose (absolute)."""
     reference_lead_s: float = 0.03
@@ -67,6 +70,7 @@ class ActionConfig:
         require_range("actions.lower_scale", self.lower_scale, 0.0, 10.0)
         require_range("actions.step_lift", self.step_lift, 0.0, 2.0)
         require_range("actions.step_stride", self.step_stride, 0.0, 2.0)
+        require_range("actions.stance_balance", self.stance_balance, 0.0, 2.0)
         require_range("actions.twist_scale", self.twist_scale, 0.0, 10.0)
         require_range("actions.upper_scale", self.upper_scale, 0.0, 10.0)
         require_range("actions.reference_lead_s", self.reference_lead_s, 0.0, 1.0)
@@ -182,6 +186,7 @@ class H1Env(VecEnv):
         self._step_motion = StepMotion(
             spec, model, cfg.commands.gait_period_s, cfg.actions.step_lift, cfg.actions.step_stride
         )
+        self.stance_balance = StanceBalance(spec, model)
         self._action_scale = torch.full((self.num_actions,), cfg.actions.lower_scale)
         self._action_scale[[j.axis == (0.0, 0.0, 1.0) for j in joints]] = cfg.actions.twist_scale
         self._action_scale[self.num_lower :] = cfg.actions.upper_scale
@@ -332,6 +337,12 @@ class H1Env(VecEnv):
         c = self.commands.current()
         step = self._step_motion(c.phase, c.velocity_h, c.yaw_rate)
         target[:, self._step_motion.joints] += (1.0 - c.stand)[:, None, None] * step
+        s, legs = self.state, self.stance_balance.joints
+        stance = self.stance_balance(
+            c.height, s.joint_pos, s.joint_vel, s.projected_gravity_t, s.torso_angular_velocity_t
+        )
+        share = self.cfg.actions.stance_balance * c.stand[:, None, None]
+        target[:, legs] += share * (stance.unsqueeze(1) - self._default[legs])
         if self.cfg.actions.upper_mode == "residual":
             upper = slice(self.num_lower, None)
             reference = self.motions.current()

@@ -7,7 +7,7 @@ from functools import lru_cache
 from importlib.resources import files
 from typing import Any
 
-from cotap.robots.spec import ArmSpec, BodySpec, FootSpec, GeomSpec, JointSpec, RobotSpec
+from cotap.robots.spec import ArmSpec, BodySpec, FootSpec, GeomSpec, JointSpec, RobotSpec, StanceSpec
 
 # kp [Nm/rad], kd [Nms/rad], default angle [rad], velocity limit [rad/s]; Unitree's gains. The default pose of the legs
 # has the centre of mass over the middle of the soles.
@@ -92,6 +92,15 @@ def _visuals(body: str) -> tuple[GeomSpec, ...]:
     return shapes[part]
 
 
+# Found by scripts/tune_stance.py. Rows: hip pitch, knee, ankle; columns: tilt, three angles, tilt rate, three rates.
+_STANCE_GAIN = (
+    (0.085, -0.092, 0.171, 0.198, 0.117, -0.029, 0.003, 0.057),
+    (0.426, -0.016, -0.864, 0.011, 0.119, 0.006, -0.054, 0.032),
+    (4.671, 1.08, -3.075, -6.935, 0.898, 0.048, -0.337, -0.821),
+)
+_STANCE_BIAS = (-0.002, -0.033, -0.065)
+
+
 def _joint(entry: dict[str, Any]) -> JointSpec:
     name: str = entry["name"]
     part = name.removeprefix("left_").removeprefix("right_")
@@ -142,6 +151,9 @@ def h1() -> RobotSpec:
                 ((f"{s}_hip_pitch", -0.35), (f"{s}_knee", 0.7), (f"{s}_ankle", -0.35)),
             )
             for s in sides
+        ),
+        stance=StanceSpec(
+            tuple((f"{s}_hip_pitch", f"{s}_knee", f"{s}_ankle") for s in sides), _STANCE_GAIN, _STANCE_BIAS
         ),
         joint_damping=facts["joint_damping"],
         joint_armature=facts["joint_armature"],

@@ -83,6 +83,19 @@ class FootSpec:
 
 
 @dataclass(frozen=True)
+class StanceSpec:
+    """Linear feedback that balances a robot on both feet, fore and aft, for its PD gains (see `cotap.envs.stance`)."""
+
+    joints: tuple[tuple[str, ...], ...]
+    """Per leg, the joints that pitch, from the hip down."""
+    gain: tuple[tuple[float, ...], ...]
+    """Per joint, what its target moves by per radian of forward tilt, per radian of each joint's error (mean of all
+    legs), and per rad/s of the same: 2 (1 + n) numbers."""
+    bias: tuple[float, ...]
+    """Per joint, what its target moves by always [rad]."""
+
+
+@dataclass(frozen=True)
 class RobotSpec:
     """A floating-base robot. `joints` is in actuator order: the lower agent's first, then the upper's."""
 
@@ -93,6 +106,7 @@ class RobotSpec:
     torso_body: str
     arms: tuple[ArmSpec, ...]
     feet: tuple[FootSpec, ...]
+    stance: StanceSpec
     joint_damping: float
     joint_armature: float
     nominal_height_m: float
