@@ -1,7 +1,7 @@
 """Search for the feedback that keeps a robot standing (`RobotSpec.stance`): the cross-entropy method in simulation.
 
-Every candidate stands in several worlds, randomised as in training, arms moving, at heights that may be commanded.
-Prints the mean of the candidates that stood best.
+Every candidate stands in several worlds, randomised as in training, arms moving, at one height: first nominal, then, once
+those gains are in the robot's description, the low one. Prints the mean of the candidates that stood best.
 """
 
 from __future__ import annotations
@@ -27,14 +27,13 @@ def make_env(num_envs: int, seed: int, threads: int) -> H1Env:
     return H1Env(cfg)
 
 
-def stand(env: H1Env, gains: torch.Tensor, seconds: float) -> tuple[torch.Tensor, torch.Tensor]:
+def stand(env: H1Env, gains: torch.Tensor, offset_m: float, seconds: float) -> tuple[torch.Tensor, torch.Tensor]:
     """How well (N,) the gains (N, n, 2 n + 3) stand, at most 1, and whether (N,) they stood to the end."""
     n = env.num_envs
-    low, high = env.cfg.commands.height_offset
-    height = env.spec.nominal_height_m + (low + (high - low) * torch.rand(n)) * (torch.rand(n) < 0.5)
+    height = torch.full((n,), env.spec.nominal_height_m + offset_m)
     env.commands.override(torch.zeros(n, 2), torch.zeros(n), torch.ones(n), height)
     env.reset()
-    env.stance_balance.gain, env.stance_balance.bias = gains[:, :, :-1], gains[:, :, -1]
+    env.stance_balance.set_gains(gains, 0 if offset_m == 0.0 else 1)
     score, standing = torch.zeros(n), torch.ones(n)
     steps = round(seconds / env.dt)
     for _ in range(steps):
@@ -50,9 +49,10 @@ def stand(env: H1Env, gains: torch.Tensor, seconds: float) -> tuple[torch.Tensor
 def main() -> int:
     """Search and print."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--generations", type=int, default=24)
-    parser.add_argument("--candidates", type=int, default=64)
-    parser.add_argument("--worlds", type=int, default=8, help="worlds per candidate")
+    parser.add_argument("--height-offset", type=float, default=0.0, help="relative to nominal [m]")
+    parser.add_argument("--generations", type=int, default=20)
+    parser.add_argument("--candidates", type=int, default=48)
+    parser.add_argument("--worlds", type=int, default=6, help="worlds per candidate")
     parser.add_argument("--seconds", type=float, default=5.0, help="how long they stand")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=0)
@@ -62,17 +62,23 @@ def main() -> int:
     torch.manual_seed(options.seed)
     env = make_env(options.candidates * options.worlds, options.seed, options.threads)
     mean, spread = torch.tensor(START), torch.tensor(SPREAD)
+    if options.height_offset != 0.0:  # on the way down from nominal height, for which the robot's gains are
+        nominal = env.spec.stance.gains[0]
+        mean = torch.cat((torch.tensor(nominal.gain), torch.tensor(nominal.bias).unsqueeze(1)), 1)
     best = max(2, options.candidates // 6)
     for generation in range(options.generations):
         candidates = mean + spread * torch.randn(options.candidates, *mean.shape)
-        score, stood = stand(env, candidates.repeat_interleave(options.worlds, 0), options.seconds)
+        score, stood = stand(
+            env, candidates.repeat_interleave(options.worlds, 0), options.height_offset, options.seconds
+        )
         score, stood = (x.reshape(options.candidates, -1).mean(1) for x in (score, stood))
         chosen = score.topk(best).indices
         mean = 0.4 * mean + 0.6 * candidates[chosen].mean(0)
         spread = 0.4 * spread + 0.6 * candidates[chosen].std(0)
         print(f"{generation}: score {score.mean():.3f}, of the best {score[chosen].mean():.3f}, which stood in "
               f"{stood[chosen].mean():.1%}", flush=True)  # fmt: skip
-    score, stood = stand(env, mean.expand(env.num_envs, *mean.shape), 2.0 * options.seconds)
+    gains = mean.expand(env.num_envs, *mean.shape)
+    score, stood = stand(env, gains, options.height_offset, 2.0 * options.seconds)
     print(f"mean: score {score.mean():.3f}, stood in {stood.mean():.1%} for {2.0 * options.seconds:g} s")
     for row in mean.tolist():
         print("gain", [round(x, 3) for x in row[:-1]], "bias", round(row[-1], 3))

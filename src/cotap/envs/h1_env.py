@@ -572,7 +572,7 @@ class H1Env(VecEnv):
         self.hand_forces.finish_episodes(done & long_enough, done & fell & ~long_enough)
 
     def _restart(self, mask: torch.Tensor) -> None:
-        """Put the worlds of `mask` on their feet: default legs with noise, arms on their reference, random heading."""
+        """Put the worlds of `mask` on their feet: nearly at rest, default legs with noise, arms on their reference, random heading."""
         n = int(mask.sum())
         self.randomizer.randomize_episode(mask, self.targets.delay_s, self.rng)
         self._kp, self._kd = self.randomizer.gains()
@@ -587,7 +587,7 @@ class H1Env(VecEnv):
         position[:, 2] = self.spec.nominal_height_m + (FIXED_BASE_LIFT_M if self.cfg.fixed_base else 0.01)
         yaw = uniform(self.rng, -math.pi, math.pi, n) * (not self.cfg.fixed_base)
         qpos = torch.cat((position, quat_about_z(yaw), joints), 1)
-        qvel = torch.cat((uniform(self.rng, -0.2, 0.2, n, 6), torch.zeros(n, self.num_actions)), 1)
+        qvel = torch.cat((uniform(self.rng, -0.05, 0.05, n, 6), torch.zeros(n, self.num_actions)), 1)
         self.sim.reset(mask, qpos, qvel)
         self.targets.reset(mask, joints)
         self._last_action[mask] = 0.0

@@ -40,10 +40,9 @@ class StanceBalance:
         """(H, n) joint angles from nominal height downwards."""
         self._offsets = torch.tensor(np.array(offsets), dtype=torch.float32)
         """(H, n) how far targets must be from the angles for PD control to carry the weight."""
-        self.gain = torch.tensor(stance.gain)
-        """(n, 2 (1 + n)), or one per world."""
-        self.bias = torch.tensor(stance.bias)
-        """(n,), or one per world."""
+        self._gains = [torch.cat((torch.tensor(g.gain), torch.tensor(g.bias).unsqueeze(1)), 1) for g in stance.gains]
+        """Of the two heights: (n, 2 (1 + n) + 1), bias last; or (N, ...), one per world."""
+        self._offsets_m = [g.height_offset_m for g in stance.gains]
 
     def __call__(
         self, height: torch.Tensor, joint_pos: torch.Tensor, joint_vel: torch.Tensor, projected_gravity: torch.Tensor,
@@ -64,8 +63,18 @@ class StanceBalance:
         offset = torch.lerp(self._offsets[row], self._offsets[row + 1], share)
         bent, bending = joint_pos[:, self.joints].mean(1), joint_vel[:, self.joints].mean(1)
         error = torch.cat((projected_gravity[:, :1], bent - pose, angular_velocity[:, 1:2], bending), 1)
-        correction = ((self.gain @ error.unsqueeze(-1)).squeeze(-1) + self.bias).clamp(-_LARGEST_RAD, _LARGEST_RAD)
-        return pose + offset + correction
+        correction = (self._gain(height) @ torch.nn.functional.pad(error, (0, 1), value=1.0).unsqueeze(-1)).squeeze(-1)
+        return pose + offset + correction.clamp(-_LARGEST_RAD, _LARGEST_RAD)
+
+    def set_gains(self, gains: torch.Tensor, which: int) -> None:
+        """Try other gains (N, n, 2 (1 + n) + 1), bias last, one per world, at the first or second tuned height."""
+        self._gains[which] = gains
+
+    def _gain(self, height: torch.Tensor) -> torch.Tensor:
+        """Linear between the two tuned heights."""
+        high, low = self._offsets_m
+        share = ((height - self._nominal - high) / (low - high)).clamp(0.0, 1.0)
+        return torch.lerp(*self._gains, share[:, None, None])
 
 
 def _stand(spec: RobotSpec, model: mujoco.MjModel, offset_m: float) -> tuple[np.ndarray, np.ndarray]:

@@ -7,7 +7,7 @@ from functools import lru_cache
 from importlib.resources import files
 from typing import Any
 
-from cotap.robots.spec import ArmSpec, BodySpec, FootSpec, GeomSpec, JointSpec, RobotSpec, StanceSpec
+from cotap.robots.spec import ArmSpec, BodySpec, FootSpec, GeomSpec, JointSpec, RobotSpec, StanceGain, StanceSpec
 
 # kp [Nm/rad], kd [Nms/rad], default angle [rad], velocity limit [rad/s]; Unitree's gains. The default pose of the legs
 # has the centre of mass over the middle of the soles.
@@ -93,12 +93,26 @@ def _visuals(body: str) -> tuple[GeomSpec, ...]:
 
 
 # Found by scripts/tune_stance.py. Rows: hip pitch, knee, ankle; columns: tilt, three angles, tilt rate, three rates.
-_STANCE_GAIN = (
-    (0.085, -0.092, 0.171, 0.198, 0.117, -0.029, 0.003, 0.057),
-    (0.426, -0.016, -0.864, 0.011, 0.119, 0.006, -0.054, 0.032),
-    (4.671, 1.08, -3.075, -6.935, 0.898, 0.048, -0.337, -0.821),
+_STANCE_GAINS = (
+    StanceGain(
+        0.0,
+        (
+            (0.285, 0.116, -0.123, 0.264, 0.096, -0.045, -0.029, 0.028),
+            (0.54, -0.003, -0.264, -0.352, 0.096, -0.034, -0.039, -0.027),
+            (5.239, 0.575, -1.649, -6.15, 0.821, -0.003, -0.293, -0.617),
+        ),
+        (-0.027, -0.011, -0.042),
+    ),
+    StanceGain(
+        -0.2,
+        (
+            (0.308, -0.216, -0.458, 0.336, 0.121, -0.061, -0.019, 0.037),
+            (0.562, -0.088, -0.657, -0.564, 0.221, -0.031, -0.036, -0.019),
+            (4.659, -0.119, -1.84, -7.82, 0.954, 0.06, -0.335, -0.658),
+        ),
+        (0.008, -0.132, -0.246),
+    ),
 )
-_STANCE_BIAS = (-0.002, -0.033, -0.065)
 
 
 def _joint(entry: dict[str, Any]) -> JointSpec:
@@ -152,9 +166,7 @@ def h1() -> RobotSpec:
             )
             for s in sides
         ),
-        stance=StanceSpec(
-            tuple((f"{s}_hip_pitch", f"{s}_knee", f"{s}_ankle") for s in sides), _STANCE_GAIN, _STANCE_BIAS
-        ),
+        stance=StanceSpec(tuple((f"{s}_hip_pitch", f"{s}_knee", f"{s}_ankle") for s in sides), _STANCE_GAINS),
         joint_damping=facts["joint_damping"],
         joint_armature=facts["joint_armature"],
         nominal_height_m=1.0205,

@@ -83,16 +83,26 @@ class FootSpec:
 
 
 @dataclass(frozen=True)
-class StanceSpec:
-    """Linear feedback that balances a robot on both feet, fore and aft, for its PD gains (see `cotap.envs.stance`)."""
+class StanceGain:
+    """Linear feedback that balances a robot on both feet, fore and aft, at one height."""
 
-    joints: tuple[tuple[str, ...], ...]
-    """Per leg, the joints that pitch, from the hip down."""
+    height_offset_m: float
+    """Torso height relative to nominal."""
     gain: tuple[tuple[float, ...], ...]
     """Per joint, what its target moves by per radian of forward tilt, per radian of each joint's error (mean of all
     legs), and per rad/s of the same: 2 (1 + n) numbers."""
     bias: tuple[float, ...]
     """Per joint, what its target moves by always [rad]."""
+
+
+@dataclass(frozen=True)
+class StanceSpec:
+    """What a robot needs to stand, for its PD gains (see `cotap.envs.stance`)."""
+
+    joints: tuple[tuple[str, ...], ...]
+    """Per leg, the joints that pitch, from the hip down."""
+    gains: tuple[StanceGain, StanceGain]
+    """At nominal height and at a low one."""
 
 
 @dataclass(frozen=True)
