@@ -1,7 +1,7 @@
 """Search for the feedback that keeps a robot standing (`RobotSpec.stance`): the cross-entropy method in simulation.
 
-Every candidate stands in several worlds, randomised as in training, arms moving, at one height: first nominal, then, once
-those gains are in the robot's description, the low one. Prints the mean of the candidates that stood best.
+Every candidate stands in several worlds, randomised as in training, arms moving, at one height: first nominal, then,
+once those gains are in the robot's description, the low one. Prints the mean of the candidates that stood best.
 """
 
 from __future__ import annotations

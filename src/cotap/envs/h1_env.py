@@ -572,7 +572,7 @@ class H1Env(VecEnv):
         self.hand_forces.finish_episodes(done & long_enough, done & fell & ~long_enough)
 
     def _restart(self, mask: torch.Tensor) -> None:
-        """Put the worlds of `mask` on their feet: nearly at rest, default legs with noise, arms on their reference, random heading."""
+        """Put the worlds of `mask` on their feet, nearly at rest: default legs with noise, arms on their reference."""
         n = int(mask.sum())
         self.randomizer.randomize_episode(mask, self.targets.delay_s, self.rng)
         self._kp, self._kd = self.randomizer.gains()

@@ -74,7 +74,8 @@ class StanceBalance:
         """Linear between the two tuned heights."""
         high, low = self._offsets_m
         share = ((height - self._nominal - high) / (low - high)).clamp(0.0, 1.0)
-        return torch.lerp(*self._gains, share[:, None, None])
+        first, second = self._gains
+        return torch.lerp(first, second, share[:, None, None])
 
 
 def _stand(spec: RobotSpec, model: mujoco.MjModel, offset_m: float) -> tuple[np.ndarray, np.ndarray]:
