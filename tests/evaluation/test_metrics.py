@@ -30,6 +30,7 @@ def trajectory(steps: int = 200, worlds: int = 2, **changes: torch.Tensor) -> Tr
         "velocity": command.clone(),
         "command": command,
         "stand": torch.zeros(steps, worlds, dtype=torch.bool),
+        "told_to_stand": torch.zeros(steps, worlds, dtype=torch.bool),
         "height": torch.full((steps, worlds), 1.0),
         "height_command": torch.full((steps, worlds), 1.0),
         "position": torch.zeros(steps, worlds, 2),
@@ -108,11 +109,26 @@ def test_measures_end_with_the_fall_and_never_include_what_follows():
 
 
 def test_stand_drift_is_the_mean_velocity_not_the_sway():
-    t = trajectory(command=torch.zeros(200, 2, 3), stand=torch.ones(200, 2, dtype=torch.bool))
+    standing = torch.ones(200, 2, dtype=torch.bool)
+    t = trajectory(command=torch.zeros(200, 2, 3), stand=standing, told_to_stand=standing)
     t.velocity.zero_()
     t.velocity[:, 0, 1] = 0.04
     t.velocity[:, 1, 0] = 0.2 * torch.sin(2.0 * math.pi * torch.arange(200) / 40)
     assert tracking_measures(t, 0.8)["stand_drift"].tolist() == pytest.approx([0.04, 0.0], abs=1e-5)
+
+
+def test_who_steps_although_told_to_stand_is_counted():
+    """Told at 1 s; counted from 2.8 s to the end at 4 s. World 0 steps from 3.4 s on and moves; world 1 stands."""
+    told, stand = torch.zeros(200, 2, dtype=torch.bool), torch.zeros(200, 2, dtype=torch.bool)
+    told[50:] = stand[50:] = True
+    stand[170:, 0] = False
+    t = trajectory(command=torch.zeros(200, 2, 3), stand=stand, told_to_stand=told)
+    t.velocity.zero_()
+    t.velocity[:, 0, 0] = 0.1
+    m = tracking_measures(t, 0.8)
+    assert m["stand_share"].tolist() == pytest.approx([0.5, 1.0])
+    assert m["stand_drift"].tolist() == pytest.approx([0.1, 0.0], abs=1e-5)
+    assert tracking_measures(trajectory(), 0.8)["stand_share"].isnan().all()
 
 
 def test_slip_counts_only_feet_in_contact():

@@ -12,6 +12,7 @@ import torch
 from cotap.agents.checkpoint import write_atomically
 from cotap.checks import require_one_of, require_positive_int, require_range
 from cotap.envs import H1Env, H1EnvConfig
+from cotap.envs.commands import STEADY_RAD
 from cotap.envs.forces import ForceProfile
 from cotap.evaluation.metrics import masked_mean
 from cotap.evaluation.rollout import Trajectory
@@ -45,7 +46,7 @@ class Impact:
     """What is measured, from the onset [s]."""
     motion: tuple[str, ...] = ()
     """Clips that the arms follow; empty holds the default pose."""
-    steady_rad: float = 0.4
+    steady_rad: float = STEADY_RAD
     """A standing robot that is leaning further than this, or is about to, steps in place until it is steady [rad]."""
     arm_actions: bool = True
     """Let the policy's own residual move the arms."""

@@ -81,6 +81,8 @@ def tracking_measures(t: Trajectory, gait_period_s: float, settle_s: float = 1.0
     slip = torch.where(contact, t.foot_speed, torch.zeros_like(t.foot_speed)).sum((0, 2)) / contact.sum(
         (0, 2)
     ).clamp_min(1)
+    told = steps_since_change(t.told_to_stand.unsqueeze(2)) >= round((settle_s + gait_period_s) / t.dt)
+    told = told & t.told_to_stand & t.alive()
     drift = moving_average(t.velocity, period)[..., :2].norm(dim=2)
     return {
         "e_lin": masked_mean(error[..., :2].norm(dim=2), ok),
@@ -91,7 +93,8 @@ def tracking_measures(t: Trajectory, gait_period_s: float, settle_s: float = 1.0
         "e_upper": masked_mean(t.arm_error.norm(dim=2), t.alive()),
         "e_ee": masked_mean(t.hand_error.mean(2), t.alive()),
         "j_upper": masked_mean(t.arm_torque.norm(dim=2), t.alive()),
-        "stand_drift": masked_mean(drift, ok_gait & t.stand),
+        "stand_drift": masked_mean(drift, told),
+        "stand_share": masked_mean(t.stand.float(), told),
         "foot_slip": torch.where(contact.any(2).any(0), slip, torch.full_like(slip, math.nan)),
         "swing_height": swing_heights(t.foot_height, t.foot_contact, ok & walking, round(0.1 / t.dt)),
         "e_path": masked_mean(t.path_error, t.alive() & torch.isfinite(t.path_error)),

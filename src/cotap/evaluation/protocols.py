@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from cotap.checks import require_positive_int, require_range
 from cotap.envs import H1EnvConfig
+from cotap.envs.commands import STEADY_RAD
 
 
 @dataclass
@@ -40,7 +41,7 @@ class VelocityTracking:
     """Reference arm motion; otherwise arms hold their default pose."""
     motion: tuple[str, ...] = ()
     """Arms follow these clips only; empty keeps the mixture that the policy was trained on."""
-    steady_rad: float = 0.4
+    steady_rad: float = STEADY_RAD
     """A standing robot that is leaning further than this, or is about to, steps in place until it is steady [rad]."""
     follow_path: bool = False
     """Lead the torso along the clips' root path instead of drawing velocity commands."""

@@ -15,6 +15,7 @@ import torch
 from cotap.agents.actors import as_dict
 from cotap.agents.checkpoint import write_atomically
 from cotap.envs import H1Env, H1EnvConfig
+from cotap.envs.commands import STEADY_RAD
 from cotap.evaluation.rollout import PolicyFunction
 from cotap.robots import RobotSpec
 from cotap.robots.mjcf import build_model
@@ -95,7 +96,7 @@ def record_tour(cfg: H1EnvConfig, policy: PolicyFunction, seed: int = 0) -> tupl
     """One nominal robot on the tour. Returns the environment and its `qpos` (T, nq) at every control step."""
     cfg.num_envs, cfg.seed = 1, seed
     cfg.randomization.enabled = cfg.hand_forces.enabled = cfg.assist.enabled = False
-    cfg.terminations.episode_s, cfg.commands.steady_rad = 1e4, 0.4
+    cfg.terminations.episode_s, cfg.commands.steady_rad = 1e4, STEADY_RAD
     env = H1Env(cfg)
     rows: list[torch.Tensor] = []
     nominal = env.spec.nominal_height_m

@@ -25,7 +25,9 @@ class Trajectory:
     command: torch.Tensor
     """(T, N, 3) what they were asked to be."""
     stand: torch.Tensor
-    """(T, N) bool."""
+    """(T, N) bool: standing, not stepping."""
+    told_to_stand: torch.Tensor
+    """(T, N) bool: to stand is what was asked, whether or not it steps at first or for its balance."""
     height: torch.Tensor
     """(T, N) [m]."""
     height_command: torch.Tensor
@@ -84,6 +86,7 @@ def _row(env: H1Env, fell: torch.Tensor) -> dict[str, torch.Tensor]:
         "velocity": torch.cat((s.torso_linear_velocity_h[:, :2], s.yaw_rate.unsqueeze(1)), 1),
         "command": torch.cat((r.command.velocity_h, r.command.yaw_rate.unsqueeze(1)), 1),
         "stand": r.command.stand > 0.5,
+        "told_to_stand": env.commands.told_to_stand,
         "height": s.height,
         "height_command": r.command.height,
         "position": s.torso_pos_w[:, :2],

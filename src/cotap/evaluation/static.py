@@ -14,6 +14,7 @@ from cotap.agents.checkpoint import write_atomically
 from cotap.checks import require_finite, require_one_of, require_positive_int, require_range
 from cotap.compliance import condition_number
 from cotap.envs import H1Env, H1EnvConfig
+from cotap.envs.commands import STEADY_RAD
 from cotap.evaluation.rollout import PolicyFunction
 
 PELVIS = ("fixed", "free")
@@ -73,7 +74,7 @@ class StaticStiffness:
         env.fixed_base = self.pelvis == "fixed"
         env.motions.clips.share = 0.0
         env.terminations.episode_s = 1e6
-        env.commands.steady_rad = 0.4
+        env.commands.steady_rad = STEADY_RAD
         env.commands.stand_probability, env.commands.height_offset = 1.0, (0.0, 0.0)
         env.force.force, env.force.hand, env.force.start_s = self.force, self.hand, self.settle_seconds
         return env
