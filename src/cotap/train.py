@@ -66,7 +66,7 @@ class PipelineOptions:
     """Where the runs go, into folders `base` and `distill`; by default runs/cotap-DATE-TIME."""
     num_envs: int = 1024
     """Number of worlds."""
-    base_iterations: int = 1300
+    base_iterations: int = 1225
     """Iterations of stage 1."""
     distill_iterations: int = 400
     """Iterations of stage 2."""

@@ -44,6 +44,7 @@ def default() -> BaseTraining:
     training = BaseTraining()
     training.env.assist.enabled = True
     training.env.num_envs = 1024
+    training.runner.iterations = 1225
     return training
 
 
