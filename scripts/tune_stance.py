@@ -13,7 +13,7 @@ import torch
 
 from cotap.envs import H1Env, H1EnvConfig
 
-# What an inverted pendulum on its ankles asks for, to begin with: columns as in StanceSpec.gain, then the bias.
+# What an inverted pendulum on its ankles asks for, to begin with: columns as in StanceGain.gain, then the bias.
 START = ((0.0,) * 9, (0.0,) * 9, (4.0, 0.0, -1.0, -7.0, 0.75, 0.0, -0.2, -1.2, 0.0))
 SPREAD = ((0.4,) * 4 + (0.1, 0.05, 0.05, 0.1, 0.05), (0.4,) * 4 + (0.1, 0.05, 0.05, 0.1, 0.1),
           (1.0,) * 4 + (0.3, 0.1, 0.1, 0.2, 0.1))  # fmt: skip
