@@ -57,7 +57,7 @@ class Symmetry:
 
     @classmethod
     def from_plain(cls, plain: dict[str, Any]) -> Symmetry:
-        """What `to_plain` gave."""
+        """What `to_plain` gave. Raises ValueError for columns that are not each other's mirror images."""
         return cls({k: _from_lists(v) for k, v in plain["observations"].items()}, _from_lists(plain["actions"]))
 
 
@@ -66,4 +66,9 @@ def _to_lists(reflection: Reflection) -> list[list[int]]:
 
 
 def _from_lists(lists: list[list[int]]) -> Reflection:
-    return Reflection(torch.tensor(lists[0]), torch.tensor(lists[1], dtype=torch.float32))
+    index, sign = lists
+    if sorted(index) != list(range(len(index))) or any(
+        index[i] != k or sign[i] != sign[k] for k, i in enumerate(index)
+    ):
+        raise ValueError("columns that should be mirror images of each other are not")
+    return Reflection(torch.tensor(index), torch.tensor(sign, dtype=torch.float32))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,9 +12,11 @@ import torch
 from dummy_env import TINY, DummyEnv
 
 from cotap.agents.actors import AgentLayout, DualActorCritic, Observations
+from cotap.agents.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
 from cotap.agents.dual_ppo import DualPPO, DualPPOConfig
 from cotap.agents.heads import Head, SymmetricHead
 from cotap.agents.runner import layout_of
+from cotap.evaluation.policy import load_policy, shipped_checkpoint
 from cotap.reflection import Reflection, Symmetry, join
 
 SWAP = Reflection(torch.tensor([1, 0, 2]), torch.tensor([1.0, 1.0, -1.0]))
@@ -124,3 +127,18 @@ def test_parts_and_joins_of_reflections():
     both = join([SWAP, Reflection(torch.tensor([0]), torch.tensor([-1.0]))])
     assert both(torch.tensor([1.0, 2.0, 3.0, 4.0])).tolist() == [2.0, 1.0, -3.0, -4.0]
     assert both.part(slice(2, 4))(torch.tensor([3.0, 4.0])).tolist() == [-3.0, -4.0]
+
+
+@pytest.mark.parametrize("columns", [[[1, 2, 0], [1, 1, 1]], [[0, 3], [1, 1]], [[1, 0], [1, -1]], [[0, 0], [1, 1]]])
+def test_columns_that_are_no_mirror_images_are_refused(columns: list[list[int]]):
+    with pytest.raises(ValueError, match="mirror images of each other are not"):
+        Symmetry.from_plain({"observations": {}, "actions": columns})
+
+
+def test_a_checkpoint_with_a_broken_symmetry_is_refused(tmp_path: Path):
+    content = load_checkpoint(shipped_checkpoint())
+    content["agents"]["symmetry"]["actions"] = [[5, 0], [1, 1]]
+    path = tmp_path / "broken.pt"
+    save_checkpoint(path, {k: v for k, v in content.items() if k not in ("format", "version")})
+    with pytest.raises(CheckpointError, match=r"broken\.pt.*mirror images"):
+        load_policy(path)

@@ -49,10 +49,10 @@ def load_policy(path: Path | str) -> Policy:
             raise CheckpointError(f"checkpoint {str(path)!r} lacks its part {part!r}")
     layout, weights, agents = content["layout"], content["model"], content["agents"]
     hidden = tuple(content["config"]["training"]["ppo"]["hidden"])
-    model = DualActorCritic(AgentLayout.from_plain(agents), hidden, 1.0)
     try:
+        model = DualActorCritic(AgentLayout.from_plain(agents), hidden, 1.0)
         model.load_state_dict(weights)
-    except RuntimeError as error:
+    except (RuntimeError, ValueError, TypeError, LookupError) as error:
         raise CheckpointError(f"checkpoint {str(path)!r} has networks that do not fit its config: {error}") from error
     model.eval()
     return Policy(model, layout, content["config"], content["kind"])
