@@ -12,6 +12,7 @@ from tensordict import TensorDict
 
 from cotap.checks import require_all_finite, require_one_of, require_positive_int, require_range, require_shape
 from cotap.compliance.kinematics import ChainPose
+from cotap.envs.blows import BlowConfig, Blows
 from cotap.envs.commands import CommandConfig, CommandSource, leaning
 from cotap.envs.disturbances import Assistance, AssistConfig, HandForceConfig, HandForces, assist_wrench
 from cotap.envs.forces import ForceProfile, ScriptedForces
@@ -118,6 +119,7 @@ class H1EnvConfig:
     terminations: TerminationConfig = field(default_factory=TerminationConfig)
     randomization: RandomizationConfig = field(default_factory=RandomizationConfig)
     hand_forces: HandForceConfig = field(default_factory=HandForceConfig)
+    blows: BlowConfig = field(default_factory=BlowConfig)
     force: ForceProfile = field(default_factory=ForceProfile)
     assist: AssistConfig = field(default_factory=AssistConfig)
 
@@ -131,7 +133,7 @@ class H1EnvConfig:
         require_range("torque_limit_scale", self.torque_limit_scale, 1e-3, 1e3)
         for part in (
             self.actions, self.upper_body, self.observations, self.commands, self.motions, self.impedance,
-            self.terminations, self.hand_forces, self.force, self.assist,
+            self.terminations, self.hand_forces, self.blows, self.force, self.assist,
         ):  # fmt: skip
             part.check()
         self.randomization.check(self.control_dt)
@@ -207,6 +209,7 @@ class H1Env(VecEnv):
         self.motions = ReferenceMotion(cfg.motions, spec, n, self.dt)
         self.path = PathFollower(cfg.impedance, n, self.dt)
         self.hand_forces = HandForces(cfg.hand_forces, n, len(spec.arms), self.dt)
+        self.blows = Blows(cfg.blows, n, len(spec.arms), self.dt)
         self.scripted = ScriptedForces(cfg.force, tuple(arm.side for arm in spec.arms), n)
         self.assistance = Assistance(cfg.assist, n, self.dt)
         self.randomizer = Randomizer(cfg.randomization, spec, self.sim)
@@ -309,6 +312,8 @@ class H1Env(VecEnv):
 
         fell = fallen(self.cfg.terminations, self.state.height, self.state.projected_gravity_t) | bad
         self.assistance.step(fell, self.samples)
+        thrown = fell & self.blows.recovering()
+        self.blows.step(fell, self.assistance.share(self.samples) == 0.0, self.rng)
         time_out = (self.episode_length_buf >= self.max_episode_length) & ~fell
         record = self._record(action, velocity_before, fell)
         self.record = record
@@ -317,7 +322,7 @@ class H1Env(VecEnv):
         done = fell | time_out
         log.update(self._log(record, fell, time_out, bad))
         if done.any():
-            self._finish(done, fell)
+            self._finish(done, fell & ~thrown)
             self._restart(done)
         self._observe(done)
         extras = {"time_outs": time_out, "falls": fell, "group_rewards": rewards, "log": log}
@@ -393,6 +398,7 @@ class H1Env(VecEnv):
             "path": self.path,
             "upper_body": self.upper_body,
             "hand_forces": self.hand_forces,
+            "blows": self.blows,
             "scripted": self.scripted,
             "assistance": self.assistance,
             "randomizer": self.randomizer,
@@ -434,6 +440,8 @@ class H1Env(VecEnv):
         to_heading = s.heading_w.transpose(1, 2) @ s.torso_rotation_w
         jacobian_h = to_heading.unsqueeze(1) @ self.reader.arm_chains.jacobian(s.arms)
         force_h = self.hand_forces.current(jacobian_h, self.arm_limits)
+        if self.cfg.blows.enabled:
+            force_h = force_h + self.blows.current()
         if self.scripted.active:
             force_h = force_h + self.scripted.at(self.dt * self.episode_length_buf)
         self._hand_force_w = (s.heading_w.unsqueeze(1) @ force_h.unsqueeze(-1)).squeeze(-1)
@@ -553,6 +561,7 @@ class H1Env(VecEnv):
             "/episode/time_outs_per_s": time_out.float().mean() / self.dt,
             "/episode/diverged": torch.tensor(float(self.num_diverged)),
             "/curriculum/hand_force": self.hand_forces.scale.mean(),
+            "/curriculum/blow": self.blows.scale.mean(),
             **self._law_log(r),
             "/curriculum/assist": torch.tensor(self.assistance.share(self.samples)),
         }
@@ -580,6 +589,7 @@ class H1Env(VecEnv):
         self.motions.reset(mask, self.rng)
         self.upper_body.reset(mask, self.rng)
         self.hand_forces.reset(mask, self.rng)
+        self.blows.reset(mask, self.rng)
         self.scripted.reset(mask, self.rng)
         joints = self._default + uniform(self.rng, -0.05, 0.05, n, self.num_actions)
         joints[:, self.num_lower :] = self.motions.current().position[mask]

@@ -79,7 +79,7 @@ class Impact:
         """Turn the environment that a policy was trained in into this protocol's. Changes and returns `env`."""
         self.check()
         env.num_envs, env.seed, env.torque_limit_scale = self.num_envs, self.seed, self.torque_limit_scale
-        env.assist.enabled = env.hand_forces.enabled = env.observations.noise.enabled = False
+        env.assist.enabled = env.hand_forces.enabled = env.blows.enabled = env.observations.noise.enabled = False
         env.randomization.enabled = self.randomize
         env.terminations.episode_s = 1e6
         env.impedance.share, env.commands.steady_rad = 0.0, self.steady_rad

@@ -66,7 +66,7 @@ class VelocityTracking:
         """Turn the environment that a policy was trained in into this protocol's. Changes and returns `env`."""
         self.check()
         env.num_envs, env.seed, env.torque_limit_scale = self.num_envs, self.seed, self.torque_limit_scale
-        env.assist.enabled = False
+        env.assist.enabled = env.blows.enabled = False
         env.observations.noise.enabled = False
         env.randomization.enabled = self.randomize
         # Episodes outlast the evaluation: what ends one is a fall.

@@ -69,7 +69,7 @@ class StaticStiffness:
         """Turn an environment into this protocol's. Changes and returns `env`."""
         self.check()
         env.num_envs, env.seed, env.torque_limit_scale = self.num_envs, self.seed, self.torque_limit_scale
-        env.assist.enabled = env.hand_forces.enabled = env.randomization.enabled = False
+        env.assist.enabled = env.hand_forces.enabled = env.blows.enabled = env.randomization.enabled = False
         env.observations.noise.enabled = False
         env.fixed_base = self.pelvis == "fixed"
         env.motions.clips.share = 0.0
