@@ -16,7 +16,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from cotap import train
 from cotap.agents.checkpoint import load_checkpoint, save_checkpoint
-from cotap.configs import BASE_RECIPES
+from cotap.configs import BASE_RECIPES, CONTINUATIONS, BaseTraining, from_plain
 from cotap.envs import H1Env
 from cotap.envs.rewards import LowerRewards, UpperRewards
 
@@ -402,12 +402,34 @@ def test_without_a_stage_both_run_and_are_summed_up(tmp_path: Path, monkeypatch:
 
     monkeypatch.setattr(train, "_parse_base", tiny)
     out = tmp_path / "both"
-    assert run(ENVS, 8, THREADS, 1, "--base-iterations", 2, "--distill-iterations", 1, RUN_DIR, out) == 0
-    assert newest(out / "base")["kind"] == "base"
+    counts = ["--base-iterations", 2, "--robust-iterations", 1, "--distill-iterations", 1]
+    assert run(ENVS, 8, THREADS, 1, *counts, RUN_DIR, out) == 0
+    assert newest(out / "base")["kind"] == newest(out / "robust")["kind"] == "base"
+    assert not newest(out / "base")["config"]["training"]["env"]["blows"]["enabled"]
+    assert newest(out / "robust")["config"]["training"]["env"]["blows"]["enabled"]
     assert newest(out / "distill")["kind"] == "distill"
     said = capsys.readouterr().out
     assert "| base | 2 | 96 |" in said
+    assert "| robust | 3 | 144 |" in said
     assert "| distill | 1 | 48 |" in said
+
+
+def test_a_recipe_that_goes_on_changes_the_checkpoints_config(monkeypatch: pytest.MonkeyPatch, checkpoint: Path):
+    options = captured(monkeypatch, "base", RESUME, checkpoint, RECIPE, "robust", LAM, 0.9)
+    kept = from_plain(BaseTraining, load_checkpoint(checkpoint)["config"]["training"])
+    expected = CONTINUATIONS["robust"](kept)
+    expected.ppo.lam = 0.9
+    assert options.training == expected
+    assert options.training.ppo.hidden == kept.ppo.hidden
+    assert options.training.env.blows.enabled
+    assert not kept.env.blows.enabled
+
+
+def test_a_recipe_that_begins_from_nothing_does_not_resume(checkpoint: Path, capsys: pytest.CaptureFixture[str]):
+    assert run("base", RESUME, checkpoint, RECIPE, "paper") == 2
+    said = capsys.readouterr().err
+    assert "recipe with --resume" in said
+    assert "robust" in said
 
 
 @pytest.mark.parametrize(

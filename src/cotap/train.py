@@ -15,7 +15,15 @@ import tyro
 
 from cotap import __version__
 from cotap.checks import require_one_of, require_positive_int, require_range
-from cotap.configs import BASE_RECIPES, DISTILL_RECIPES, BaseTraining, DistillTraining, from_plain, to_plain
+from cotap.configs import (
+    BASE_RECIPES,
+    CONTINUATIONS,
+    DISTILL_RECIPES,
+    BaseTraining,
+    DistillTraining,
+    from_plain,
+    to_plain,
+)
 
 SHORTCUTS = {"--num-envs": "--env.num-envs", "--iterations": "--runner.iterations"}
 STAGES = ("base", "distill")
@@ -33,7 +41,8 @@ class BaseOptions:
     resume: str = ""
     """Checkpoint to go on from; its config is the default for every option."""
     recipe: str = "default"
-    """default, or paper (the paper's networks)."""
+    """default (from nothing to walking), paper (the same with the paper's networks), or robust (blows and loads on the
+    hands): with --resume, what a policy that walks learns next, from nothing without it."""
     command: tyro.conf.Suppress[str] = ""
     training: Annotated[BaseTraining, tyro.conf.arg(name="")] = field(default_factory=BASE_RECIPES["default"])
 
@@ -59,15 +68,17 @@ class DistillOptions:
 
 @dataclass
 class PipelineOptions:
-    """Both stages, one after the other: a base policy, then its distillation. For more options, train stage by stage:
+    """Both stages: a base policy that walks, then takes blows and loads, then its distillation. For more options:
     `python -m cotap.train base --help`, `python -m cotap.train distill --help`."""
 
     run_dir: str = ""
-    """Where the runs go, into folders `base` and `distill`; by default runs/cotap-DATE-TIME."""
+    """Where the runs go, into folders `base`, `robust` and `distill`; by default runs/cotap-DATE-TIME."""
     num_envs: int = 1024
     """Number of worlds."""
     base_iterations: int = 1225
-    """Iterations of stage 1."""
+    """Iterations of stage 1 from nothing to walking."""
+    robust_iterations: int = 1375
+    """Iterations of stage 1 after that, with blows and loads on the hands."""
     distill_iterations: int = 400
     """Iterations of stage 2."""
     seed: int = 0
@@ -77,7 +88,7 @@ class PipelineOptions:
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
-        for name in ("num_envs", "base_iterations", "distill_iterations"):
+        for name in ("num_envs", "base_iterations", "robust_iterations", "distill_iterations"):
             require_positive_int(name, getattr(self, name))
         require_range("threads", self.threads, 0, 4096)
 
@@ -113,10 +124,16 @@ def _expand(args: list[str]) -> list[str]:
 def _parse_base(args: list[str]) -> BaseOptions:
     """Options on top of the resumed checkpoint's config, or else of the recipe's."""
     args = _expand(args)
-    recipe = require_one_of("recipe", _peek(args, "--recipe") or "default", BASE_RECIPES.keys())
-    resumed = _peek(args, "--resume")
-    training = _config_of(resumed, BaseTraining) if resumed else BASE_RECIPES[recipe]()
-    default = BaseOptions(recipe=recipe, training=training)
+    recipe, resumed = _peek(args, "--recipe"), _peek(args, "--resume")
+    if recipe:
+        require_one_of("recipe", recipe, BASE_RECIPES.keys())
+    if resumed:
+        training = _config_of(resumed, BaseTraining)
+        if recipe:
+            training = CONTINUATIONS[require_one_of("recipe with --resume", recipe, CONTINUATIONS.keys())](training)
+    else:
+        training = BASE_RECIPES[recipe or "default"]()
+    default = BaseOptions(recipe=recipe or "default", training=training)
     return tyro.cli(BaseOptions, args=args, default=default, prog="python -m cotap.train base")
 
 
@@ -233,10 +250,14 @@ def train_both(options: PipelineOptions) -> Path:
     options.check()
     run_dir = Path(options.run_dir) if options.run_dir else _new_run_dir("cotap")
     common = ["--num-envs", str(options.num_envs), "--seed", str(options.seed), "--threads", str(options.threads)]
-    base_args = [*common, "--iterations", str(options.base_iterations), "--run-dir", str(run_dir / "base")]
-    base = _parse_base(base_args)
-    base.command = " ".join(["python -m cotap.train base", *base_args])
-    checkpoint = str(_newest(train_base(base)))
+    walking = _train_base_with(
+        [*common, "--iterations", str(options.base_iterations), "--run-dir", str(run_dir / "base")]
+    )
+    total = options.base_iterations + options.robust_iterations
+    checkpoint = _train_base_with(
+        [*common, "--recipe", "robust", "--resume", walking, "--iterations", str(total),
+         "--run-dir", str(run_dir / "robust")]
+    )  # fmt: skip
     distill_args = [
         *common, "--base-checkpoint", checkpoint, "--iterations", str(options.distill_iterations),
         "--run-dir", str(run_dir / "distill"),
@@ -246,6 +267,13 @@ def train_both(options: PipelineOptions) -> Path:
     train_distill(distill)
     print(_summary(run_dir))
     return run_dir
+
+
+def _train_base_with(args: list[str]) -> str:
+    """Run stage 1 as if typed with `args`. Returns its newest checkpoint."""
+    options = _parse_base(args)
+    options.command = " ".join(["python -m cotap.train base", *args])
+    return str(_newest(train_base(options)))
 
 
 def _newest(run_dir: Path) -> Path:
@@ -258,12 +286,12 @@ def _summary(run_dir: Path) -> str:
     """What each stage took, as a Markdown table."""
     from cotap.agents.checkpoint import load_checkpoint
 
-    lines = ["| stage | iterations | samples | seconds | checkpoint |", "|---|---|---|---|---|"]
-    for stage in STAGES:
-        path = _newest(run_dir / stage)
+    lines = ["| run | iterations | samples | seconds | checkpoint |", "|---|---|---|---|---|"]
+    for part in ("base", "robust", "distill"):
+        path = _newest(run_dir / part)
         content = load_checkpoint(path)
         lines.append(
-            f"| {stage} | {content['iteration']} | {content['samples']:,} | {content['wall_seconds']:.0f} | {path} |"
+            f"| {part} | {content['iteration']} | {content['samples']:,} | {content['wall_seconds']:.0f} | {path} |"
         )
     return "\n".join(lines)
 

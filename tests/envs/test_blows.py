@@ -13,7 +13,7 @@ DT = 0.02
 
 
 def made(n: int = 400, **fields: object) -> tuple[Blows, torch.Generator]:
-    blows = Blows(BlowConfig(enabled=True, **fields), n, 2, DT)  # pyright: ignore[reportArgumentType]
+    blows = Blows(BlowConfig(enabled=True, **{"episode_share": 1.0, **fields}), n, 2, DT)  # pyright: ignore[reportArgumentType]
     rng = torch.Generator().manual_seed(0)
     blows.reset(torch.ones(n, dtype=torch.bool), rng)
     return blows, rng
@@ -67,6 +67,17 @@ def test_size_grows_for_blows_taken_and_falls_for_those_that_throw() -> None:
     torch.testing.assert_close(blows.scale, torch.tensor([0.52, 0.1, 0.52]))
 
 
+def test_some_episodes_are_spared() -> None:
+    blows, rng = made(2000, episode_share=0.25)
+    nobody = torch.zeros(2000, dtype=torch.bool)
+    struck = torch.zeros(2000, dtype=torch.bool)
+    for _ in range(450):
+        struck |= blows.current().any(2).any(1)
+        blows.step(nobody, True, rng)
+    assert struck.float().mean().item() == pytest.approx(0.25, abs=0.04)
+    assert (blows.scale[~struck] == blows.cfg.curriculum_start).all(), "what is spared proves nothing"
+
+
 def test_sizes_stay_while_the_gantry_holds_the_robot() -> None:
     blows, rng = made(8)
     for _ in range(600):
@@ -77,12 +88,7 @@ def test_sizes_stay_while_the_gantry_holds_the_robot() -> None:
 def test_blows_reach_the_robot_and_come_back_from_a_snapshot() -> None:
     cfg = H1EnvConfig(num_envs=4, num_threads=1)
     cfg.hand_forces.enabled = False
-    cfg.blows.enabled, cfg.blows.interval_s, cfg.blows.recovery_s, cfg.blows.curriculum_start = (
-        True,
-        (0.1, 0.1),
-        0.1,
-        1.0,
-    )
+    cfg.blows = BlowConfig(enabled=True, episode_share=1.0, interval_s=(0.1, 0.1), recovery_s=0.1, curriculum_start=1.0)
     env = H1Env(cfg)
     still = torch.zeros(4, env.num_actions)
     largest, state, after = 0.0, None, []

@@ -195,3 +195,16 @@ def test_assist_wrench_by_hand(errors, force, torque):
 def test_bad_fields_are_named(cfg, match):
     with pytest.raises(ValueError, match=match):
         cfg.check()
+
+
+def test_loads_of_some_episodes_only(rng):
+    hands = forces(4000, episode_share=0.3, curriculum_start=0.5, zero_probability=0.0)
+    hands.reset(everyone(4000), rng)
+    jacobian, limit = torch.zeros(4000, 2, 3, 4), STRONG
+    loaded = hands.current(jacobian, limit).abs().sum((1, 2)) > 0.0
+    assert loaded.float().mean().item() == pytest.approx(0.3, abs=0.03)
+    for _ in range(300):  # forces change within an episode, which worlds bear them does not
+        hands.step(rng)
+    assert torch.equal(hands.current(jacobian, limit).abs().sum((1, 2)) > 0.0, loaded)
+    hands.finish_episodes(everyone(4000), ~everyone(4000))
+    assert torch.equal(hands.scale > 0.5, loaded), "what bears no load proves nothing"

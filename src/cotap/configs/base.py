@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -11,6 +12,7 @@ from cotap.agents.dual_ppo import DualPPOConfig
 from cotap.agents.runner import RunnerConfig
 from cotap.checks import require_range
 from cotap.envs import H1EnvConfig
+from cotap.envs.commands import STEADY_RAD
 
 
 @dataclass
@@ -40,7 +42,7 @@ class BaseTraining:
 
 
 def default() -> BaseTraining:
-    """What the shipped base policy was trained with."""
+    """From nothing to a policy that walks."""
     training = BaseTraining()
     training.env.assist.enabled = True
     training.env.num_envs = 1024
@@ -55,4 +57,25 @@ def paper() -> BaseTraining:
     return training
 
 
-BASE_RECIPES: dict[str, Callable[[], BaseTraining]] = {"default": default, "paper": paper}
+def robust(training: BaseTraining | None = None) -> BaseTraining:
+    """What a policy that walks learns next, on top of its own config or else of the default: to take blows and loads
+    on its hands, and to step where standing does not do any more."""
+    training = copy.deepcopy(training) if training else default()
+    env = training.env
+    env.commands.steady_rad = STEADY_RAD
+    env.commands.stand_probability = 0.4
+    env.blows.enabled = True
+    env.hand_forces.episode_share = 0.5
+    env.hand_forces.curriculum_start = 0.2
+    env.hand_forces.curriculum_back = 0.1
+    env.rewards.lower.foot_slip = -1.5
+    env.rewards.lower.track_mean_velocity = 3.0
+    env.rewards.lower.track_mean_yaw_rate = 1.2
+    training.ppo.least_std = 0.12
+    training.runner.iterations = 2600
+    return training
+
+
+BASE_RECIPES: dict[str, Callable[[], BaseTraining]] = {"default": default, "paper": paper, "robust": robust}
+CONTINUATIONS: dict[str, Callable[[BaseTraining], BaseTraining]] = {"robust": robust}
+"""Recipes that may also go on from a checkpoint, and then change its config."""

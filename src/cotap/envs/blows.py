@@ -19,6 +19,8 @@ class BlowConfig:
 
     enabled: bool = False
     """Whether there are any; training switches them on."""
+    episode_share: float = 0.5
+    """Share of the episodes that have blows."""
     force: tuple[float, float] = (100.0, 500.0)
     """Size of a full blow, uniform [N]."""
     duration_s: tuple[float, float] = (0.02, 0.06)
@@ -42,7 +44,7 @@ class BlowConfig:
         require_range("blows.duration_s[0]", self.duration_s[0], 0.0, 10.0)
         require_range("blows.recovery_s", self.recovery_s, 0.0, 60.0)
         require_range("blows.interval_s[0]", self.interval_s[0], self.recovery_s, 1e6)
-        for name in ("curriculum_start", "curriculum_step", "curriculum_back"):
+        for name in ("episode_share", "curriculum_start", "curriculum_step", "curriculum_back"):
             require_range(f"blows.{name}", getattr(self, name), 0.0, 1.0)
 
 
@@ -69,6 +71,8 @@ class Blows(Stateful):
         # Nothing to recover from: the clock begins where a blow would count as taken.
         self._since_s[mask] = self.cfg.recovery_s + self._dt
         self._interval_s[mask] = uniform(rng, *self.cfg.interval_s, int(mask.sum())) + self.cfg.recovery_s
+        spared = torch.rand(int(mask.sum()), generator=rng) >= self.cfg.episode_share
+        self._interval_s[mask] = torch.where(spared, torch.inf, self._interval_s[mask])
 
     def recovering(self) -> torch.Tensor:
         """(N,) bool: a blow set in no longer ago than `recovery_s`."""

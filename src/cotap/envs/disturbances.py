@@ -16,6 +16,8 @@ class HandForceConfig:
 
     enabled: bool = True
     """Whether hands are loaded at all."""
+    episode_share: float = 1.0
+    """Share of the episodes in which hands are loaded."""
     force_x: tuple[float, float] = (-40.0, 40.0)
     """[N]."""
     force_y: tuple[float, float] = (-40.0, 40.0)
@@ -40,31 +42,44 @@ class HandForceConfig:
         for name in ("force_x", "force_y", "force_z", "hold_s"):
             require_interval(f"hand_forces.{name}", getattr(self, name))
         require_range("hand_forces.hold_s[0]", self.hold_s[0], 0.02, 1e6)
-        for name in ("zero_probability", "torque_share", "curriculum_start", "curriculum_step", "curriculum_back"):
+        for name in (
+            "episode_share",
+            "zero_probability",
+            "torque_share",
+            "curriculum_start",
+            "curriculum_step",
+            "curriculum_back",
+        ):
             require_range(f"hand_forces.{name}", getattr(self, name), 0.0, 1.0)
 
 
 class HandForces(Stateful):
     """Piecewise constant forces at each hand, with a curriculum per world."""
 
-    STATE = ("_force_h", "_remaining_s", "scale")
+    STATE = ("_force_h", "_remaining_s", "_loaded", "scale")
 
     def __init__(self, cfg: HandForceConfig, num_envs: int, num_hands: int, dt: float) -> None:
         cfg.check()
         self.cfg, self._dt = cfg, dt
         self._force_h = torch.zeros(num_envs, num_hands, 3)
         self._remaining_s = torch.zeros(num_envs)
+        self._loaded = torch.ones(num_envs, dtype=torch.bool)
         self.scale = torch.full((num_envs,), cfg.curriculum_start)
 
     def finish_episodes(self, lasted: torch.Tensor, fell_early: torch.Tensor) -> None:
         """Adapt the curriculum of worlds whose episode ended; both masks (num_envs,) bool."""
         step = self.cfg.curriculum_step * lasted.float() - self.cfg.curriculum_back * fell_early.float()
-        self.scale = (self.scale + step).clamp(0.0, 1.0)
+        self.scale = (self.scale + step * self._loaded).clamp(0.0, 1.0)
 
     def reset(self, mask: torch.Tensor, rng: torch.Generator) -> None:
-        """New forces for the worlds of `mask`."""
+        """An episode begins in the worlds of `mask`."""
+        if self.cfg.enabled:
+            self._loaded[mask] = torch.rand(int(mask.sum()), generator=rng) < self.cfg.episode_share
+            self._draw(mask, rng)
+
+    def _draw(self, mask: torch.Tensor, rng: torch.Generator) -> None:
         n, hands = int(mask.sum()), self._force_h.shape[1]
-        if n == 0 or not self.cfg.enabled:
+        if n == 0:
             return
         cfg = self.cfg
         bounds = (cfg.force_x, cfg.force_y, cfg.force_z)
@@ -74,8 +89,9 @@ class HandForces(Stateful):
 
     def step(self, rng: torch.Generator) -> None:
         """Advance by one control step; forces that have been held long enough change."""
-        self._remaining_s = self._remaining_s - self._dt
-        self.reset(self._remaining_s <= 0.0, rng)
+        if self.cfg.enabled:
+            self._remaining_s = self._remaining_s - self._dt
+            self._draw(self._remaining_s <= 0.0, rng)
 
     def current(self, jacobian_h: torch.Tensor, torque_limit: torch.Tensor) -> torch.Tensor:
         """Forces (N, hands, 3) in the heading frame, never beyond what the arms' torque limits can hold.
@@ -84,7 +100,7 @@ class HandForces(Stateful):
             jacobian_h: (N, hands, 3, n) hand Jacobians in the heading frame.
             torque_limit: (hands, n) [Nm].
         """
-        force = self._force_h * self.scale[:, None, None]
+        force = self._force_h * (self.scale * self._loaded)[:, None, None]
         torque = (jacobian_h.transpose(-1, -2) @ force.unsqueeze(-1)).squeeze(-1).abs()
         holdable = (self.cfg.torque_share * torque_limit / torque.clamp_min(1e-6)).amin(-1).clamp_max(1.0)
         return force * holdable.unsqueeze(-1)

@@ -84,6 +84,6 @@ class VelocityTracking:
         f = env.hand_forces
         f.enabled = self.hand_force > 0.0
         f.force_x = f.force_y = f.force_z = (-self.hand_force, self.hand_force)
-        f.zero_probability, f.curriculum_start = 0.0, 1.0
+        f.zero_probability, f.curriculum_start, f.episode_share = 0.0, 1.0, 1.0
         f.curriculum_step = f.curriculum_back = 0.0
         return env
