@@ -3,32 +3,46 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from pathlib import Path
+from typing import Any
 
 from cotap.agents.checkpoint import load_checkpoint, save_checkpoint, sha256, write_json
 from cotap.evaluate import main as evaluate
 from cotap.evaluation.policy import shipped_checkpoint
 
+VELOCITY = ["velocity-tracking", "--num-envs", "1024"]
+SMALL = ["--num-envs", "64", "--threads", "1"]
 EVALUATIONS = {
-    "velocity-tracking": ["velocity-tracking", "--num-envs", "1024"],
-    "velocity-tracking.hand-forces": ["velocity-tracking", "--num-envs", "1024", "--hand-force", "40"],
-    "velocity-tracking.held-out": [
-        "velocity-tracking",
-        "--num-envs",
-        "512",
-        "--motion",
-        "dance_b",
-        "dance_b_mirrored",
-        "kick",
-        "kick_mirrored",
-    ],
-    "velocity-tracking.small": ["velocity-tracking", "--num-envs", "64", "--episode-seconds", "10", "--threads", "1"],
-}
+    "base": {
+        "velocity-tracking": VELOCITY,
+        "velocity-tracking.hand-forces": [*VELOCITY, "--hand-force", "40"],
+        "velocity-tracking.held-out": [
+            "velocity-tracking", "--num-envs", "512",
+            "--motion", "dance_b", "dance_b_mirrored", "kick", "kick_mirrored",
+        ],
+        "velocity-tracking.small": ["velocity-tracking", "--episode-seconds", "10", *SMALL],
+    },
+    "cotap": {
+        "velocity-tracking": [*VELOCITY, "--method", "cotap"],
+        "velocity-tracking.small": ["velocity-tracking", "--episode-seconds", "10", "--method", "cotap", *SMALL],
+        "impact.stance": ["impact", "--num-envs", "1024", "--method", "cotap"],
+        "impact.walking": ["impact", "--num-envs", "1024", "--method", "cotap", "--mode", "walking"],
+    },
+}  # fmt: skip
+"""What vouches for each policy; the small one is repeated by the tests."""
 
 
-def ship(source: Path, stage: str) -> int:
+def earlier_runs(run_dirs: list[Path]) -> list[dict[str, Any]]:
+    """Command and commit of the runs that a policy went through before its own, from their config.json."""
+    runs = [json.loads((path / "config.json").read_text()) for path in run_dirs]
+    return [{key: run[key] for key in ("command", "commit")} for run in runs]
+
+
+def ship(source: Path, stage: str, before: list[Path]) -> int:
     """Strip, save, describe, evaluate. Returns the exit status."""
+    earlier = earlier_runs(before)
     content = load_checkpoint(source)
     target = shipped_checkpoint(stage)
     target.parent.mkdir(exist_ok=True)
@@ -41,6 +55,7 @@ def ship(source: Path, stage: str) -> int:
             "sha256": sha256(target),
             "commit": config["commit"],
             "command": config["command"],
+            "earlier_runs": earlier,
             "seed": config["training"]["seed"],
             "iterations": content["iteration"],
             "samples": content["samples"],
@@ -49,7 +64,7 @@ def ship(source: Path, stage: str) -> int:
             "config": config["training"],
         },
     )
-    for name, options in EVALUATIONS.items():
+    for name, options in EVALUATIONS[stage].items():
         out = target.with_name(f"{target.stem}.{name}.json")
         if evaluate([*options, "--checkpoint", str(target), "--json", str(out)]) != 0:
             return 2
@@ -60,9 +75,13 @@ def main() -> int:
     """Parse and ship."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("checkpoint", type=Path)
-    parser.add_argument("--stage", default="base")
+    parser.add_argument("--stage", default="base", choices=EVALUATIONS)
+    parser.add_argument(
+        "--before", type=Path, nargs="*", default=[], metavar="RUN_DIR",
+        help="folders of the runs that this one went on from, oldest first",
+    )  # fmt: skip
     options = parser.parse_args()
-    return ship(options.checkpoint, options.stage)
+    return ship(options.checkpoint, options.stage, options.before)
 
 
 if __name__ == "__main__":

@@ -215,7 +215,7 @@ def _train(stage: str, options: BaseOptions | DistillOptions, base: dict[str, An
     guide = _guide(env, options, base) if isinstance(options, DistillOptions) else None
     runner = DualRunner(env, training.runner, training.ppo, run_dir, config, training.device, guide)
     if guide and not options.resume:
-        runner.alg.model.load_state_dict(guide.model.state_dict())
+        guide.start(runner.alg.model)
     if options.resume:
         runner.load(options.resume)
     # Last, so that nothing is left behind when any of the above refuses.

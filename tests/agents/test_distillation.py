@@ -14,7 +14,9 @@ from torch.distributions import Independent, Normal, kl_divergence
 from cotap.agents.actors import DualActorCritic
 from cotap.agents.distillation import DistillationConfig, Guide
 from cotap.agents.dual_ppo import DualPPO, DualPPOConfig
+from cotap.agents.heads import SymmetricHead
 from cotap.agents.runner import layout_of
+from cotap.reflection import Reflection
 
 
 def base_policy(seed: int = 5) -> DualActorCritic:
@@ -48,7 +50,7 @@ def test_penalty_is_the_kl_of_torch_distributions():
     new = Independent(Normal(before.model.actors["lower"](stored["policy"]), before.model.log_std["lower"].exp()), 1)
     old = Independent(Normal(base_mean[:, SLICES["lower"]], base.log_std["lower"].exp()), 1)
     assert log["lower/base_kl"] == pytest.approx(float(kl_divergence(new, old).mean().detach()), rel=1e-4)
-    assert log["lower/base_beta"] == 0.5
+    assert log["lower/base_beta"] == DistillationConfig().beta
     assert 0.0 < log["lower/base_share"] < 1.0
     assert "upper/base_kl" not in log
 
@@ -117,3 +119,25 @@ def test_guidance_goes_on_where_it_stopped():
 def test_bad_fields_are_named(field, value):
     with pytest.raises(ValueError, match=rf"distillation\.{field}"):
         Guide(base_policy(), DistillationConfig(**{field: value}))
+
+
+def test_a_distilled_policy_begins_with_less_of_what_nobody_guides():
+    base, model = base_policy(), base_policy(seed=6)
+    guided_agent, free_agent = AGENTS
+    Guide(base, DistillationConfig(agents=("lower",), free_start=0.25)).start(model)
+    x = {name: torch.randn(5, width) for name, width in base.layout.observation_widths.items()}
+    of_base, started = base(x), model(x)
+    assert of_base.abs().max() > 0.01
+    torch.testing.assert_close(started[:, SLICES[guided_agent]], of_base[:, SLICES[guided_agent]])
+    torch.testing.assert_close(started[:, SLICES[free_agent]], 0.25 * of_base[:, SLICES[free_agent]])
+
+
+def test_a_symmetric_networks_output_can_be_scaled():
+    torch.manual_seed(0)
+    swap = Reflection(torch.tensor([1, 0]), torch.tensor([1.0, -1.0]))
+    head, x = SymmetricHead(swap, swap, (6, 4), 1.0), torch.randn(7, 2)
+    with torch.no_grad():
+        head.output_bias.uniform_(-1.0, 1.0)
+        before = head(x)
+        head.scale_output(0.3)
+        torch.testing.assert_close(head(x), 0.3 * before)

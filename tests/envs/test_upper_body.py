@@ -122,6 +122,15 @@ def test_parameters_are_drawn_per_world_arm_and_axis_and_drawn_again(make_env):
     assert (p.alpha != before).all()
 
 
+def test_a_share_of_the_draws_is_all_compliance(make_env):
+    cfg = fresh(COTAP)
+    cfg.sampling = LawSampling(enabled=True, alpha=(0.2, 0.9), full_alpha=0.25)
+    alpha = make_env(1000, upper_body=cfg).upper_body.parameters.alpha
+    assert float((alpha == 0.9).float().mean()) == pytest.approx(0.25, abs=0.03)
+    assert float(alpha.min()) >= 0.2
+    assert float(alpha[alpha < 0.9].mean()) == pytest.approx(0.55, abs=0.02)
+
+
 def test_a_late_command_is_mixed_with_the_one_before(make_env):
     env = make_env(2, upper_body=fresh(COTAP))
     drive(env, 3)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import torch
 
 from cotap.agents.actors import DualActorCritic, Observations
+from cotap.agents.heads import Head, SymmetricHead
 from cotap.agents.losses import gaussian_kl
 from cotap.checks import require_one_of, require_range
 
@@ -17,17 +18,21 @@ from cotap.checks import require_one_of, require_range
 class DistillationConfig:
     """How strongly, how long and whom the frozen policy guides."""
 
-    beta: float = 0.5
+    beta: float = 0.2
     """Weight of `KL(new || base)` at the start."""
     end_iterations: int = 300
     """Iterations in which the weight falls linearly to zero."""
     agents: tuple[str, ...] = ("lower",)
     """Agents that are guided."""
+    free_start: float = 0.3
+    """Factor on the actions of agents that are not guided, at the start: the base's arm actions are feedback for PD's
+    gains, and through stiffness of several times those they swing the arms."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
         require_range("distillation.beta", self.beta, 0.0, 1e3)
         require_range("distillation.end_iterations", self.end_iterations, 1, 10**9)
+        require_range("distillation.free_start", self.free_start, 0.0, 10.0)
         for name in self.agents:
             require_one_of("distillation.agents", name, ("lower", "upper"))
 
@@ -47,6 +52,13 @@ class Guide:
         for parameter in self.model.parameters():
             parameter.requires_grad_(False)
         self._fingerprint = self.fingerprint()
+
+    def start(self, model: DualActorCritic) -> None:
+        """Give `model` the base's weights, and less of the actions of agents that nobody guides."""
+        model.load_state_dict(self.model.state_dict())
+        for name, actor in model.actors.items():
+            if name not in self.cfg.agents:
+                cast(Head | SymmetricHead, actor).scale_output(self.cfg.free_start)
 
     def fingerprint(self) -> float:
         """A number that any change of the frozen policy changes."""

@@ -31,8 +31,12 @@ def default(base: BaseTraining) -> DistillTraining:
     env.assist.enabled = False
     env.upper_body.left.name = env.upper_body.right.name = "cotap"
     env.upper_body.sampling.enabled = True
-    env.rewards.upper.stay_close = 0.5
-    env.hand_forces.curriculum_start = 0.5
+    env.upper_body.sampling.full_alpha = 0.25
+    # What the base's upper agent adds to the reference is feedback; through a stiffness of several times PD's it swings
+    # the arms, and through any it is felt at the hand beside the stiffness that is asked for.
+    env.rewards.upper.arm_residual = -0.3
+    env.rewards.upper.upper_action_rate = -0.05
+    env.rewards.upper.stay_close = 1.0
     # The base's spread is where exploration goes on from, not where it began.
     training.ppo.initial_std = training.ppo.least_std
     training.runner.iterations = 400
@@ -42,7 +46,8 @@ def default(base: BaseTraining) -> DistillTraining:
 def paper(base: BaseTraining) -> DistillTraining:
     """The paper's range of stiffness (its Table II)."""
     training = default(base)
-    training.env.upper_body.sampling.stiffness = (150.0, 450.0)
+    sampling = training.env.upper_body.sampling
+    sampling.stiffness, sampling.full_alpha = (150.0, 450.0), 0.0
     return training
 
 

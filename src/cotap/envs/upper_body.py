@@ -47,6 +47,8 @@ class LawSampling:
     """Uniform [Nm/rad]."""
     alpha: tuple[float, float] = (0.0, 1.0)
     """Uniform."""
+    full_alpha: float = 0.0
+    """Share of the draws that take the largest alpha instead: what a rollout of compliance alone meets all the time."""
     hold_s: tuple[float, float] = (2.0, 6.0)
     """Time between changes [s]."""
 
@@ -58,6 +60,7 @@ class LawSampling:
         require_range("upper_body.sampling.null_stiffness[0]", self.null_stiffness[0], 0.1, 1e4)
         for i, value in enumerate(self.alpha):
             require_range(f"upper_body.sampling.alpha[{i}]", value, 0.0, 1.0)
+        require_range("upper_body.sampling.full_alpha", self.full_alpha, 0.0, 1.0)
         require_range("upper_body.sampling.hold_s[0]", self.hold_s[0], 0.02, 1e6)
 
 
@@ -140,7 +143,8 @@ class UpperBody(Stateful):
         low, high = (math.log(bound) for bound in cfg.stiffness)
         p.stiffness[mask] = uniform(rng, low, high, n, arms, 3).exp()
         p.null_stiffness[mask] = uniform(rng, *cfg.null_stiffness, n, arms)
-        p.alpha[mask] = uniform(rng, *cfg.alpha, n, arms)
+        full = torch.rand(n, arms, generator=rng) < cfg.full_alpha
+        p.alpha[mask] = torch.where(full, cfg.alpha[1], uniform(rng, *cfg.alpha, n, arms))
         self._hold_s[mask] = uniform(rng, *cfg.hold_s, n)
 
     def send(self, state: RobotState, target: torch.Tensor) -> None:
