@@ -79,7 +79,7 @@ class PipelineOptions:
     """Iterations of stage 1 from nothing to walking."""
     robust_iterations: int = 1375
     """Iterations of stage 1 after that, with blows and loads on the hands."""
-    distill_iterations: int = 400
+    distill_iterations: int = 900
     """Iterations of stage 2."""
     seed: int = 0
     """Seed of both stages."""

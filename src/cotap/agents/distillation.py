@@ -18,9 +18,9 @@ from cotap.checks import require_one_of, require_range
 class DistillationConfig:
     """How strongly, how long and whom the frozen policy guides."""
 
-    beta: float = 0.2
+    beta: float = 0.1
     """Weight of `KL(new || base)` at the start."""
-    end_iterations: int = 300
+    end_iterations: int = 200
     """Iterations in which the weight falls linearly to zero."""
     agents: tuple[str, ...] = ("lower",)
     """Agents that are guided."""

@@ -27,8 +27,8 @@ class Head(nn.Module):
     def scale_output(self, factor: float) -> None:
         """Multiply what comes out by `factor` from now on."""
         last = cast(nn.Linear, self.mlp[-1])
-        last.weight *= factor
-        last.bias *= factor
+        last.weight.mul_(factor)
+        last.bias.mul_(factor)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """(N, inputs) to (N, outputs), float32."""
@@ -81,8 +81,8 @@ class SymmetricHead(nn.Module):
     @torch.no_grad()
     def scale_output(self, factor: float) -> None:
         """Multiply what comes out by `factor` from now on."""
-        self.output_weight *= factor
-        self.output_bias *= factor
+        self.output_weight.mul_(factor)
+        self.output_bias.mul_(factor)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """(N, inputs) to (N, outputs), float32."""
