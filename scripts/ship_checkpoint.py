@@ -8,7 +8,7 @@ from pathlib import Path
 
 from cotap.agents.checkpoint import load_checkpoint, save_checkpoint, sha256, write_json
 from cotap.evaluate import main as evaluate
-from cotap.evaluation.policy import shipped_checkpoint
+from cotap.evaluation.policy import CHECKPOINTS, checkpoint_path
 
 EVALUATIONS = {
     "velocity-tracking": ["velocity-tracking", "--num-envs", "1024"],
@@ -27,10 +27,10 @@ EVALUATIONS = {
 }
 
 
-def ship(source: Path, stage: str) -> int:
+def ship(source: Path, name: str) -> int:
     """Strip, save, describe, evaluate. Returns the exit status."""
     content = load_checkpoint(source)
-    target = shipped_checkpoint(stage)
+    target = checkpoint_path(name)
     target.parent.mkdir(exist_ok=True)
     save_checkpoint(target, content | {"learner": {}, "env": {}})
     config = content["config"]
@@ -49,8 +49,8 @@ def ship(source: Path, stage: str) -> int:
             "config": config["training"],
         },
     )
-    for name, options in EVALUATIONS.items():
-        out = target.with_name(f"{target.stem}.{name}.json")
+    for evaluation, options in EVALUATIONS.items():
+        out = target.with_name(f"{target.stem}.{evaluation}.json")
         if evaluate([*options, "--checkpoint", str(target), "--json", str(out)]) != 0:
             return 2
     return 0
@@ -60,9 +60,9 @@ def main() -> int:
     """Parse and ship."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("checkpoint", type=Path)
-    parser.add_argument("--stage", default="base")
+    parser.add_argument("--name", default="base", choices=CHECKPOINTS)
     options = parser.parse_args()
-    return ship(options.checkpoint, options.stage)
+    return ship(options.checkpoint, options.name)
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ from cotap.envs.observations import (
     noise_amplitude,
 )
 from cotap.envs.persistence import uniform
+from cotap.envs.punches import PunchConfig, Punches
 from cotap.envs.randomization import RandomizationConfig, Randomizer
 from cotap.envs.reference import ReferenceConfig, ReferenceMotion
 from cotap.envs.rewards import LowerRewards, RewardGroup, StepRecord, UpperRewards, check_weights
@@ -35,6 +36,7 @@ from cotap.envs.terminations import TerminationConfig, diverged, fallen
 from cotap.envs.upper_body import UpperBody, UpperBodyConfig
 from cotap.reflection import Symmetry
 from cotap.robots import ROBOTS
+from cotap.robots.ground import HALF_EXTENT_M
 from cotap.robots.mjcf import COLLISIONS, FIXED_BASE_LIFT_M, build_model
 from cotap.rotations import quat_about_z, quat_from_matrix, rotate
 from cotap.sim import DelayedTargets, Simulation, Snapshot
@@ -108,6 +110,8 @@ class H1EnvConfig:
     """Factor on the robot's torque limits."""
     fixed_base: bool = False
     """Hold the base in the air: for measurements on the arms alone."""
+    unevenness_m: float = 0.0
+    """Height of the ground's bumps from lowest to highest [m]; 0 is flat. Worlds start at different places on it."""
     actions: ActionConfig = field(default_factory=ActionConfig)
     upper_body: UpperBodyConfig = field(default_factory=UpperBodyConfig)
     observations: ObservationConfig = field(default_factory=ObservationConfig)
@@ -119,6 +123,7 @@ class H1EnvConfig:
     randomization: RandomizationConfig = field(default_factory=RandomizationConfig)
     hand_forces: HandForceConfig = field(default_factory=HandForceConfig)
     force: ForceProfile = field(default_factory=ForceProfile)
+    punches: PunchConfig = field(default_factory=PunchConfig)
     assist: AssistConfig = field(default_factory=AssistConfig)
 
     def check(self) -> None:
@@ -129,9 +134,10 @@ class H1EnvConfig:
         require_one_of("collision", self.collision, COLLISIONS)
         require_range("control_dt", self.control_dt, 1e-4, 1.0)
         require_range("torque_limit_scale", self.torque_limit_scale, 1e-3, 1e3)
+        require_range("unevenness_m", self.unevenness_m, 0.0, 0.2)
         for part in (
             self.actions, self.upper_body, self.observations, self.commands, self.motions, self.impedance,
-            self.terminations, self.hand_forces, self.force, self.assist,
+            self.terminations, self.hand_forces, self.force, self.punches, self.assist,
         ):  # fmt: skip
             part.check()
         self.randomization.check(self.control_dt)
@@ -168,7 +174,7 @@ class H1Env(VecEnv):
         self.action_slices = {"lower": slice(0, self.num_lower), "upper": slice(self.num_lower, self.num_actions)}
         self.rng = torch.Generator().manual_seed(cfg.seed)
 
-        model = build_model(spec, cfg.collision, cfg.control_dt / cfg.substeps, cfg.fixed_base)
+        model = build_model(spec, cfg.collision, cfg.control_dt / cfg.substeps, cfg.fixed_base, cfg.unevenness_m)
         model.actuator_forcerange[:] *= cfg.torque_limit_scale
         self.sim = Simulation(model, n, cfg.substeps, cfg.num_threads, Randomizer.FIELDS)
         self.dt = self.sim.dt
@@ -194,6 +200,8 @@ class H1Env(VecEnv):
         self.reader = StateReader(spec, self.sim)
         self.arm_limits = self.reader.arm_joints(self._torque_limit.unsqueeze(0))[0]
         self._hand_bodies = [model.body(arm.hand_body).id for arm in spec.arms]
+        self._arm_links = [b for arm in spec.arms for b in spec.chain(arm.hand_body, spec.torso_body)]
+        self._arm_bodies = [model.body(link.name).id for link in self._arm_links]
         self._hand_lever = torch.stack(
             [torch.tensor(a.hand_point) - torch.tensor(spec.body(a.hand_body).com) for a in spec.arms]
         )
@@ -207,7 +215,8 @@ class H1Env(VecEnv):
         self.motions = ReferenceMotion(cfg.motions, spec, n, self.dt)
         self.path = PathFollower(cfg.impedance, n, self.dt)
         self.hand_forces = HandForces(cfg.hand_forces, n, len(spec.arms), self.dt)
-        self.scripted = ScriptedForces(cfg.force, tuple(arm.side for arm in spec.arms), n)
+        self.scripted = ScriptedForces(cfg.force, tuple(arm.side for arm in spec.arms), n, self.dt)
+        self.punches = Punches(cfg.punches, n, self.num_actions - self.num_lower, self.dt)
         self.assistance = Assistance(cfg.assist, n, self.dt)
         self.randomizer = Randomizer(cfg.randomization, spec, self.sim)
         self.upper_body = UpperBody(cfg.upper_body, spec, n)
@@ -238,6 +247,11 @@ class H1Env(VecEnv):
         """Which observation groups actors and critics read (rsl_rl's `obs_groups`)."""
         noisy = self.cfg.observations.noise.enabled
         return {"actor": ["policy"], "critic": ["clean" if noisy else "policy", "privileged"]}
+
+    @property
+    def hand_force_w(self) -> torch.Tensor:
+        """(N, H, 3) force at each hand in the last step, world frame [N]."""
+        return self._hand_force_w
 
     @property
     def symmetry(self) -> Symmetry:
@@ -306,6 +320,7 @@ class H1Env(VecEnv):
         self._follow_path()
         self.upper_body.step(self.dt, self.rng)
         self.hand_forces.step(self.rng)
+        self.punches.step(self.rng)
 
         fell = fallen(self.cfg.terminations, self.state.height, self.state.projected_gravity_t) | bad
         self.assistance.step(fell, self.samples)
@@ -394,6 +409,7 @@ class H1Env(VecEnv):
             "upper_body": self.upper_body,
             "hand_forces": self.hand_forces,
             "scripted": self.scripted,
+            "punches": self.punches,
             "assistance": self.assistance,
             "randomizer": self.randomizer,
             "history": self.history,
@@ -435,12 +451,16 @@ class H1Env(VecEnv):
         jacobian_h = to_heading.unsqueeze(1) @ self.reader.arm_chains.jacobian(s.arms)
         force_h = self.hand_forces.current(jacobian_h, self.arm_limits)
         if self.scripted.active:
-            force_h = force_h + self.scripted.at(self.dt * self.episode_length_buf)
+            scripted_h = self.scripted.at(self.dt * self.episode_length_buf)
+            force_h = force_h + scripted_h[:, :-1]
+            self.sim.xfrc[:, self._base_body, :3] = rotate(s.heading_w, scripted_h[:, -1]).double()
         self._hand_force_w = (s.heading_w.unsqueeze(1) @ force_h.unsqueeze(-1)).squeeze(-1)
         hand_rotation_w = s.torso_rotation_w.unsqueeze(1) @ s.arms.rotation
         lever_w = rotate(hand_rotation_w, self._hand_lever)
         for i, body in enumerate(self._hand_bodies):
             self.sim.apply_force(body, self._hand_force_w[:, i], lever_w[:, i])
+        if self.punches.active:
+            self._punch()
         share = self.assistance.share(self.samples)
         if self.cfg.assist.enabled:
             command = self.commands.current()
@@ -451,6 +471,18 @@ class H1Env(VecEnv):
                 command.yaw_rate - s.yaw_rate, command.height - s.height, s.torso_linear_velocity_h[:, 2],
             )  # fmt: skip
             self.sim.xfrc[:, self._base_body] = share * torch.cat((force, torque), 1).double()
+
+    def _punch(self) -> None:
+        """Add the blows on the arms' joints to what acts on the links already."""
+        s = self.state
+        rotations_w = (s.torso_rotation_w[:, None, None] @ s.arms.rotations).flatten(1, 2)
+        blows_w = self.punches.current()
+        for i, link in enumerate(self._arm_links):
+            # The joint is the origin of the link's frame.
+            lever_w = -rotate(rotations_w[:, i], torch.tensor(link.com))
+            wrench = torch.cat((blows_w[:, i], torch.linalg.cross(lever_w, blows_w[:, i])), 1).double()
+            body = self._arm_bodies[i]
+            self.sim.xfrc[:, body] = wrench + (self.sim.xfrc[:, body] if body in self._hand_bodies else 0.0)
 
     def _record(self, action: torch.Tensor, velocity_before: torch.Tensor, fell: torch.Tensor) -> StepRecord:
         s, command, reference = self.state, self.commands.current(), self.motions.current()
@@ -581,10 +613,14 @@ class H1Env(VecEnv):
         self.upper_body.reset(mask, self.rng)
         self.hand_forces.reset(mask, self.rng)
         self.scripted.reset(mask, self.rng)
+        self.punches.reset(mask, self.rng)
         joints = self._default + uniform(self.rng, -0.05, 0.05, n, self.num_actions)
         joints[:, self.num_lower :] = self.motions.current().position[mask]
         position = torch.zeros(n, 3)
         position[:, 2] = self.spec.nominal_height_m + (FIXED_BASE_LIFT_M if self.cfg.fixed_base else 0.01)
+        if self.cfg.unevenness_m > 0.0:
+            position[:, :2] = uniform(self.rng, -0.5 * HALF_EXTENT_M, 0.5 * HALF_EXTENT_M, n, 2)
+            position[:, 2] += 0.5 * self.cfg.unevenness_m
         yaw = uniform(self.rng, -math.pi, math.pi, n) * (not self.cfg.fixed_base)
         qpos = torch.cat((position, quat_about_z(yaw), joints), 1)
         qvel = torch.cat((uniform(self.rng, -0.05, 0.05, n, 6), torch.zeros(n, self.num_actions)), 1)

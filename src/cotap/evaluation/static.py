@@ -10,14 +10,13 @@ from typing import Any
 import torch
 
 from cotap.agents.actors import as_dict
-from cotap.agents.checkpoint import write_atomically
 from cotap.checks import require_finite, require_one_of, require_positive_int, require_range
 from cotap.compliance import condition_number
 from cotap.envs import H1Env, H1EnvConfig
 from cotap.envs.commands import STEADY_RAD
+from cotap.evaluation.report import save_figure
 from cotap.evaluation.rollout import PolicyFunction
-
-PELVIS = ("fixed", "free")
+from cotap.evaluation.scenario import PELVIS, mirrored_pose
 
 
 @dataclass
@@ -109,7 +108,7 @@ def measure(env: H1Env, protocol: StaticStiffness, policy: PolicyFunction | None
     side = [arm.side for arm in env.spec.arms].index(protocol.hand)
     levels = torch.linspace(0.0, 1.0, protocol.levels).repeat_interleave(protocol.repeats)
     env.scripted.amplitude_h = env.scripted.amplitude_h * levels[:, None, None]
-    env.motions.hold(_pose(env, protocol.arm_pose))
+    env.motions.hold(mirrored_pose(env, protocol.arm_pose))
     obs = env.reset()
     fell = torch.zeros(env.num_envs, dtype=torch.bool)
     averages: list[torch.Tensor] = []
@@ -148,16 +147,6 @@ def measure(env: H1Env, protocol: StaticStiffness, policy: PolicyFunction | None
         torch.stack(forces), torch.stack(means), float(condition.mean()),
         bool((torque.abs() > 0.999 * limit).any()), int(fell.sum()), torch.stack(spreads),
     )  # fmt: skip
-
-
-def _pose(env: H1Env, left: tuple[float, ...]) -> torch.Tensor:
-    """Arm joints (U,) with `left` on the left arm and its mirror image on every other."""
-    by_name = {j.name: j for j in env.spec.joints}
-    values = dict(zip(env.spec.arms[0].joints, left, strict=True))
-    for name in list(values):
-        joint = by_name[name]
-        values[joint.mirror_name] = joint.mirror_sign * values[name]
-    return torch.tensor([values[n] for n in env.spec.upper_joints])
 
 
 def summary(result: StaticResult, commanded: tuple[float, ...] | None) -> dict[str, Any]:
@@ -219,5 +208,4 @@ def plot(path: Path, result: StaticResult, commanded: tuple[float, ...] | None, 
     axis.set(xlabel="displacement along the load [mm]", ylabel="force [N]")
     axis.grid(alpha=0.2)
     axis.legend(frameon=False)
-    write_atomically(path, lambda p: figure.savefig(p, dpi=130, format=path.suffix.lstrip(".") or "png"))
-    plt.close(figure)
+    save_figure(figure, path)
