@@ -17,8 +17,12 @@ import tyro
 from cotap.checks import require_one_of
 from cotap.configs import from_plain, to_plain
 from cotap.evaluation.disturbance import ConstantLoad, Impact
+from cotap.evaluation.fall_curve import FallCurve
 from cotap.evaluation.law_options import LawOptions
+from cotap.evaluation.modulation import Modulation
+from cotap.evaluation.periodic import PeriodicLoad
 from cotap.evaluation.protocols import VelocityTracking
+from cotap.evaluation.punches import PunchWalk
 from cotap.evaluation.scenario import Scenario
 from cotap.evaluation.static import StaticStiffness
 
@@ -80,6 +84,41 @@ class ConstantLoadOptions(ScenarioOptions):
     """A load on a hand, held: errors of hand, arm and torso, torques, effective stiffness, falls."""
 
     protocol: tyro.conf.OmitArgPrefixes[ConstantLoad] = field(default_factory=ConstantLoad)
+
+
+@dataclass
+class PeriodicLoadOptions(ScenarioOptions):
+    """A load on both hands that swings slowly: torques of each arm beside what statics asks for.
+
+    By default the left arm is compliant and the right one under PD; `--left "" --right ""` gives both `--method`.
+    """
+
+    laws: tyro.conf.OmitArgPrefixes[LawOptions] = field(
+        default_factory=lambda: LawOptions(left="cotap:alpha=0.7,stiffness=500", right="pd")
+    )
+    protocol: tyro.conf.OmitArgPrefixes[PeriodicLoad] = field(default_factory=PeriodicLoad)
+
+
+@dataclass
+class PunchesOptions(ScenarioOptions):
+    """A walk over waypoints while the arms take punches: who arrives."""
+
+    protocol: tyro.conf.OmitArgPrefixes[PunchWalk] = field(default_factory=PunchWalk)
+
+
+@dataclass
+class FallCurveOptions(ScenarioOptions):
+    """Fall rate against impulse, and the impulse at which half of the worlds fall."""
+
+    protocol: tyro.conf.OmitArgPrefixes[FallCurve] = field(default_factory=FallCurve)
+
+
+@dataclass
+class ModulationOptions(ScenarioOptions):
+    """Stiffness and blend stepped and ramped over their whole range: falls, torque, energy."""
+
+    laws: tyro.conf.OmitArgPrefixes[LawOptions] = field(default_factory=lambda: LawOptions(method="cotap"))
+    protocol: tyro.conf.OmitArgPrefixes[Modulation] = field(default_factory=Modulation)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -269,6 +308,10 @@ PROTOCOLS: dict[str, tuple[type[Any], Callable[[Any], dict[str, Any]]]] = {
     "static-stiffness": (StaticStiffnessOptions, static_stiffness),
     "impact": (ImpactOptions, partial(scenario, "impact")),
     "constant-load": (ConstantLoadOptions, partial(scenario, "constant-load")),
+    "periodic-load": (PeriodicLoadOptions, partial(scenario, "periodic-load")),
+    "punches": (PunchesOptions, partial(scenario, "punches")),
+    "fall-curve": (FallCurveOptions, partial(scenario, "fall-curve")),
+    "modulation": (ModulationOptions, partial(scenario, "modulation")),
 }
 """Every protocol's options and what runs it."""
 

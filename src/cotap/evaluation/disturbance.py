@@ -77,7 +77,9 @@ class Impact(Scenario):
         begin, end = (onset + round(bound / t.dt) for bound in self.window)
         stood = ~t.fell.any(0)
         everyone = torch.ones_like(stood)
-        window = window_measures(t, begin, end, hit) | response_measures(t, onset, begin, end, hit)
+        window = window_measures(t, begin, end, hit)
+        if any(self.force):
+            window |= response_measures(t, onset, begin, end, hit)
         episode = window_measures(t, 0, len(t.fell), hit)
         return {
             "falls": falls_by_time(t, onset, end),

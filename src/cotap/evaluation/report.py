@@ -16,6 +16,7 @@ UNITS = {
     "e_ee": "m", "j_upper": "Nm", "stand_drift": "m/s", "foot_slip": "m/s", "swing_height": "m", "e_path": "m",
     "e_torso": "m/s", "e_ee_hit": "m", "peak_torque": "Nm", "energy": "J", "recovery_s": "s",
     "displacement_x": "m", "displacement_y": "m", "displacement_z": "m",
+    "seconds_upright": "s",
 }  # fmt: skip
 
 
