@@ -18,6 +18,7 @@ from cotap.checks import require_one_of
 from cotap.configs import from_plain, to_plain
 from cotap.evaluation.disturbance import ConstantLoad, Impact
 from cotap.evaluation.fall_curve import FallCurve
+from cotap.evaluation.fidelity import Fidelity
 from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.modulation import Modulation
 from cotap.evaluation.periodic import PeriodicLoad
@@ -27,6 +28,8 @@ from cotap.evaluation.scenario import Scenario
 from cotap.evaluation.static import StaticStiffness
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from cotap.envs import H1Env, H1EnvConfig
     from cotap.evaluation.policy import Policy
 
@@ -45,6 +48,8 @@ class CommonOptions:
     plot: str = ""
     """Write a plot here (PNG)."""
     laws: tyro.conf.OmitArgPrefixes[LawOptions] = field(default_factory=LawOptions)
+    singularity_ratio: bool = True
+    """Go back to PD near singular arms (paper, equation 9). Without it, for the ablation that was trained so."""
 
 
 @dataclass
@@ -61,6 +66,14 @@ class StaticStiffnessOptions(CommonOptions):
     """Commanded against effective stiffness of a hand under a load."""
 
     protocol: tyro.conf.OmitArgPrefixes[StaticStiffness] = field(default_factory=StaticStiffness)
+
+
+@dataclass
+class FidelityOptions(CommonOptions):
+    """Commanded against felt stiffness over many arm poses, axes and stiffnesses, by default while standing."""
+
+    laws: tyro.conf.OmitArgPrefixes[LawOptions] = field(default_factory=lambda: LawOptions(method="cotap"))
+    protocol: tyro.conf.OmitArgPrefixes[Fidelity] = field(default_factory=Fidelity)
 
 
 @dataclass
@@ -157,6 +170,7 @@ def _prepare(options: CommonOptions, protocol: Any) -> tuple[H1Env, Policy, str]
 
     protocol.check()
     upper_body = options.laws.configure()
+    upper_body.singularity_ratio = options.singularity_ratio
     for name in ("json", "plot", "video"):
         _require_folder(name, getattr(options, name, ""))
     if options.threads:
@@ -271,6 +285,60 @@ def static_stiffness(options: StaticStiffnessOptions) -> dict[str, Any]:
     return result
 
 
+def fidelity(options: FidelityOptions) -> dict[str, Any]:
+    """Measure, print the table, write what was asked for, and return the result."""
+    from cotap.agents.checkpoint import write_json
+    from cotap.evaluation.fidelity import measure, plot, summary, table
+
+    protocol = options.protocol
+    env, policy, checkpoint = _prepare(options, protocol)
+    if env.cfg.upper_body.of(protocol.hand).name in ("pd", "soft-pd"):
+        raise ValueError("fidelity needs a law with a stiffness at the hand, such as --method cotap")
+    start = time.perf_counter()
+    measured, coverage = measure(env, protocol, policy)
+    result = _result("fidelity", options, protocol, env, checkpoint) | {
+        "num_falls": int(measured.fell.sum()),
+        "seconds": time.perf_counter() - start,
+        **summary(measured, coverage, protocol),
+        "window": {"start": 2.0 * protocol.settle_seconds - 1.0, "end": 2.0 * protocol.settle_seconds},
+    }
+    print(table(result))
+    if options.json:
+        write_json(Path(options.json), result)
+    if options.plot:
+        plot(Path(options.plot), result)
+    return result
+
+
+def pictures(args: list[str], times: tuple[float, ...], width: int = 480, height: int = 480) -> list[np.ndarray]:
+    """Pictures (height, width, 3) of the first world of a protocol that disturbs it, at these times [s].
+
+    Args:
+        args: As for `evaluate`.
+        times: Within the evaluation [s].
+        width: [pixels].
+        height: [pixels].
+
+    Raises:
+        ValueError: bad input; the message names it.
+        RenderingUnavailable: there is no OpenGL to be had.
+    """
+    from cotap.evaluation.render import film_frames
+    from cotap.evaluation.rollout import record_rollout
+
+    kind, _ = PROTOCOLS[require_one_of("protocol", args[0], PROTOCOLS.keys())]
+    options = tyro.cli(kind, args=args[1:])
+    protocol = options.protocol
+    env, policy, _ = _prepare(options, protocol)
+    protocol.prepare(env)
+    steps = round(max(times) / env.dt)
+    trajectory = record_rollout(
+        env, policy, steps, arm_actions=protocol.arm_actions, before_step=protocol.before_step, film=True
+    )
+    rows = [min(max(round(time / env.dt) - 1, 0), steps - 1) for time in times]
+    return list(film_frames(env, trajectory.film[rows], width, height))
+
+
 def scenario(name: str, options: ScenarioOptions) -> dict[str, Any]:
     """Run, print the table, write what was asked for, and return the result."""
     from cotap.agents.checkpoint import write_json
@@ -306,6 +374,7 @@ def scenario(name: str, options: ScenarioOptions) -> dict[str, Any]:
 PROTOCOLS: dict[str, tuple[type[Any], Callable[[Any], dict[str, Any]]]] = {
     "velocity-tracking": (VelocityTrackingOptions, velocity_tracking),
     "static-stiffness": (StaticStiffnessOptions, static_stiffness),
+    "fidelity": (FidelityOptions, fidelity),
     "impact": (ImpactOptions, partial(scenario, "impact")),
     "constant-load": (ConstantLoadOptions, partial(scenario, "constant-load")),
     "periodic-load": (PeriodicLoadOptions, partial(scenario, "periodic-load")),

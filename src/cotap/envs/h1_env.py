@@ -18,6 +18,7 @@ from cotap.envs.forces import ForceProfile, ScriptedForces
 from cotap.envs.gait import StepMotion, desired_contact, swing_progress
 from cotap.envs.impedance import ImpedanceConfig, PathFollower
 from cotap.envs.observations import (
+    GOALS_PER_ARM,
     ObservationConfig,
     ObservationHistory,
     actor_terms,
@@ -221,11 +222,14 @@ class H1Env(VecEnv):
         self.randomizer = Randomizer(cfg.randomization, spec, self.sim)
         self.upper_body = UpperBody(cfg.upper_body, spec, n)
         self.targets = DelayedTargets(n, self.num_actions, cfg.substeps, self.dt)
-        terms = actor_terms(self.num_actions, self.num_actions - self.num_lower)
+        num_upper, sees = self.num_actions - self.num_lower, cfg.observations.arm_torque == "actor"
+        goals = GOALS_PER_ARM * len(spec.arms) * cfg.observations.goals
+        terms = actor_terms(self.num_actions, num_upper, sees, goals)
+        self._critic_terms = critic_terms(len(spec.arms), 0 if sees else num_upper)
         self.history = ObservationHistory(terms, n, cfg.observations.history)
         self._clean_history = ObservationHistory(terms, n, cfg.observations.history)
         self._noise = noise_amplitude(terms, cfg.observations.noise)
-        self._critic_scale = torch.cat([torch.full((w,), s) for _, w, s in critic_terms(len(spec.arms))])
+        self._critic_scale = torch.cat([torch.full((w,), s) for _, w, s in self._critic_terms])
         self._groups = (
             RewardGroup("lower", cfg.rewards.lower, self.dt),
             RewardGroup("upper", cfg.rewards.upper, self.dt),
@@ -258,7 +262,7 @@ class H1Env(VecEnv):
         """The mirror images of observations and actions."""
         terms, steps = self.history.terms, self.history.steps
         actor = actor_reflection(self.spec, terms, steps)
-        critic = critic_reflection(self.spec, critic_terms(len(self.spec.arms)))
+        critic = critic_reflection(self.spec, self._critic_terms)
         return Symmetry(
             {"policy": actor, "clean": actor, "privileged": critic}, joint_reflection(self.spec, self.spec.joint_names)
         )
@@ -271,7 +275,7 @@ class H1Env(VecEnv):
             "joints": list(self.spec.joint_names),
             "terms": [list(t) for t in self.history.terms],
             "history": self.history.steps,
-            "critic_terms": [list(t) for t in critic_terms(len(self.spec.arms))],
+            "critic_terms": [list(t) for t in self._critic_terms],
             "actions": asdict(c.actions),
             "control_dt": c.control_dt,
         }
@@ -637,28 +641,41 @@ class H1Env(VecEnv):
         """Append the present to the history of every world and assemble the observation groups."""
         s, c = self.state, self.commands.current()
         angle, walking = 2.0 * math.pi * c.phase, 1.0 - c.stand
+        torque = self.joint_torque(s)[:, self.num_lower :]
+        actor_sees = self.cfg.observations.arm_torque == "actor"
         present = torch.cat(
             (
                 s.torso_angular_velocity_t, s.projected_gravity_t, c.velocity_h, c.yaw_rate.unsqueeze(1),
                 c.stand.unsqueeze(1), c.height.unsqueeze(1), self.motions.current().position,
                 s.joint_pos - self._default, s.joint_vel, self._last_action,
                 (walking * angle.sin()).unsqueeze(1), (walking * angle.cos()).unsqueeze(1),
-                self.joint_torque(s)[:, self.num_lower :],
+                *((torque,) if actor_sees else ()), *((self._goals(),) if self.cfg.observations.goals else ()),
             ),
             1,
         )  # fmt: skip
         present = present * self.history.scale
-        groups = {"privileged": self._privileged(s) * self._critic_scale}
+        groups = {"privileged": self._privileged(s, None if actor_sees else torque) * self._critic_scale}
         if self.cfg.observations.noise.enabled:
             groups["clean"] = self._clean_history.append(present, restarted)
             present = present + self._noise * uniform(self.rng, -1.0, 1.0, *present.shape)
         groups["policy"] = self.history.append(present, restarted)
         self._observations = TensorDict(groups, batch_size=[self.num_envs])
 
-    def _privileged(self, s: RobotState) -> torch.Tensor:
+    def _goals(self) -> torch.Tensor:
+        """What the arms' laws are asked for, (N, 5 A), of the order of one."""
+        p = self.upper_body.parameters
+        stiffness, null = (p.stiffness / 300.0).log(), (p.null_stiffness / 40.0).log()
+        return torch.cat((stiffness, null.unsqueeze(2), p.alpha.unsqueeze(2)), 2).flatten(1)
+
+    def _privileged(self, s: RobotState, torque: torch.Tensor | None) -> torch.Tensor:
+        """What only critics see; with arm torque (N, U) where actors do not."""
         return torch.cat(
-            (quat_from_matrix(s.torso_rotation_w), s.torso_linear_velocity_h, self._hand_force_w.flatten(1)), 1
-        )
+            (
+                quat_from_matrix(s.torso_rotation_w), s.torso_linear_velocity_h,
+                *(() if torque is None else (torque,)), self._hand_force_w.flatten(1),
+            ),
+            1,
+        )  # fmt: skip
 
 
 def _mean(values: torch.Tensor) -> torch.Tensor:

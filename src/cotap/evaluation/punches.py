@@ -38,7 +38,7 @@ class PunchWalk(Scenario):
     """Distance from one waypoint to the next [m]."""
     turn: float = 1.0
     """Largest change of direction at a waypoint [rad]."""
-    radius: float = 0.3
+    radius: float = 0.5
     """A waypoint is reached within this distance [m]."""
     episode_seconds: float = 60.0
     """Time to reach them all [s]."""
