@@ -163,12 +163,14 @@ def window_measures(t: Trajectory, begin: int, end: int, hit: list[int]) -> dict
     alive = t.alive()[begin:end]
     torque = part.arm_torque.norm(dim=2)
     power = (part.arm_torque * part.arm_velocity).abs().sum(2)
+    error = (part.velocity - part.command)[..., :2]
     seen = alive.any(0)
     nothing = torch.full(seen.shape, math.nan)
     peak = torch.where(alive, part.arm_torque.abs().amax(2), torch.zeros_like(torque)).amax(0)
     energy = torch.where(alive, power, torch.zeros_like(power)).sum(0) * t.dt
     return {
-        "e_torso": masked_mean((part.velocity - part.command)[..., :2].norm(dim=2), alive),
+        "e_torso": masked_mean(error.norm(dim=2), alive),
+        **{f"e_torso_{axis}": masked_mean(error[..., i].abs(), alive) for i, axis in enumerate("xy")},
         "e_ee": masked_mean(part.hand_error.mean(2), alive),
         "e_ee_hit": masked_mean(part.hand_error[..., hit].mean(2), alive),
         "j_upper": masked_mean(torque, alive),
