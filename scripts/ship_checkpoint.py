@@ -10,7 +10,7 @@ from typing import Any
 
 from cotap.agents.checkpoint import load_checkpoint, save_checkpoint, sha256, write_json
 from cotap.evaluate import main as evaluate
-from cotap.evaluation.policy import shipped_checkpoint
+from cotap.evaluation.policy import checkpoint_path
 
 VELOCITY = ["velocity-tracking", "--num-envs", "1024"]
 SMALL = ["--num-envs", "64", "--threads", "1"]
@@ -40,11 +40,11 @@ def earlier_runs(run_dirs: list[Path]) -> list[dict[str, Any]]:
     return [{key: run[key] for key in ("command", "commit")} for run in runs]
 
 
-def ship(source: Path, stage: str, before: list[Path]) -> int:
+def ship(source: Path, name: str, before: list[Path]) -> int:
     """Strip, save, describe, evaluate. Returns the exit status."""
     earlier = earlier_runs(before)
     content = load_checkpoint(source)
-    target = shipped_checkpoint(stage)
+    target = checkpoint_path(name)
     target.parent.mkdir(exist_ok=True)
     save_checkpoint(target, content | {"learner": {}, "env": {}})
     config = content["config"]
@@ -64,8 +64,8 @@ def ship(source: Path, stage: str, before: list[Path]) -> int:
             "config": config["training"],
         },
     )
-    for name, options in EVALUATIONS[stage].items():
-        out = target.with_name(f"{target.stem}.{name}.json")
+    for evaluation, options in EVALUATIONS[name].items():
+        out = target.with_name(f"{target.stem}.{evaluation}.json")
         if evaluate([*options, "--checkpoint", str(target), "--json", str(out)]) != 0:
             return 2
     return 0
@@ -75,13 +75,13 @@ def main() -> int:
     """Parse and ship."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("checkpoint", type=Path)
-    parser.add_argument("--stage", default="base", choices=EVALUATIONS)
+    parser.add_argument("--name", default="base", choices=EVALUATIONS)
     parser.add_argument(
         "--before", type=Path, nargs="*", default=[], metavar="RUN_DIR",
         help="folders of the runs that this one went on from, oldest first",
     )  # fmt: skip
     options = parser.parse_args()
-    return ship(options.checkpoint, options.stage, options.before)
+    return ship(options.checkpoint, options.name, options.before)
 
 
 if __name__ == "__main__":

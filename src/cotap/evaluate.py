@@ -17,11 +17,19 @@ import tyro
 from cotap.checks import require_one_of
 from cotap.configs import from_plain, to_plain
 from cotap.evaluation.disturbance import ConstantLoad, Impact
+from cotap.evaluation.fall_curve import FallCurve
+from cotap.evaluation.fidelity import Fidelity
 from cotap.evaluation.law_options import LawOptions
+from cotap.evaluation.modulation import Modulation
+from cotap.evaluation.periodic import PeriodicLoad
 from cotap.evaluation.protocols import VelocityTracking
+from cotap.evaluation.punches import PunchWalk
+from cotap.evaluation.scenario import Scenario
 from cotap.evaluation.static import StaticStiffness
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from cotap.envs import H1Env, H1EnvConfig
     from cotap.evaluation.policy import Policy
 
@@ -31,7 +39,8 @@ class CommonOptions:
     """What every evaluation takes."""
 
     checkpoint: str = ""
-    """Checkpoint to evaluate; by default the shipped base policy."""
+    """Checkpoint to evaluate, a file or the name of a shipped one. By default the shipped base policy for
+    velocity-tracking, and for all others the shipped policy that was distilled under compliance, if there is one."""
     threads: int = 0
     """Processor threads; 0 takes every processor. Results are reproducible for one number."""
     json: str = ""
@@ -39,6 +48,8 @@ class CommonOptions:
     plot: str = ""
     """Write a plot here (PNG)."""
     laws: tyro.conf.OmitArgPrefixes[LawOptions] = field(default_factory=LawOptions)
+    singularity_ratio: bool = True
+    """Go back to PD near singular arms (paper, equation 9). Without it, for the ablation that was trained so."""
 
 
 @dataclass
@@ -58,50 +69,113 @@ class StaticStiffnessOptions(CommonOptions):
 
 
 @dataclass
-class ImpactOptions(CommonOptions):
-    """A blow on a hand: errors of hand, arm and torso, torques, falls."""
+class FidelityOptions(CommonOptions):
+    """Commanded against felt stiffness over many arm poses, axes and stiffnesses, by default while standing."""
+
+    laws: tyro.conf.OmitArgPrefixes[LawOptions] = field(default_factory=lambda: LawOptions(method="cotap"))
+    protocol: tyro.conf.OmitArgPrefixes[Fidelity] = field(default_factory=Fidelity)
+
+
+@dataclass
+class ScenarioOptions(CommonOptions):
+    """What protocols take that disturb a robot that stands or walks."""
+
+    video: str = ""
+    """Write a video of the first world here (MP4); a contact sheet (PNG) goes beside it."""
+    protocol: tyro.conf.OmitArgPrefixes[Scenario] = field(default_factory=Scenario)
+
+
+@dataclass
+class ImpactOptions(ScenarioOptions):
+    """A blow on a hand: errors of hand, arm and torso, torques, recovery, falls."""
 
     protocol: tyro.conf.OmitArgPrefixes[Impact] = field(default_factory=Impact)
 
 
 @dataclass
-class ConstantLoadOptions(CommonOptions):
-    """A load on a hand, held: errors of hand, arm and torso, torques, falls."""
+class ConstantLoadOptions(ScenarioOptions):
+    """A load on a hand, held: errors of hand, arm and torso, torques, effective stiffness, falls."""
 
     protocol: tyro.conf.OmitArgPrefixes[ConstantLoad] = field(default_factory=ConstantLoad)
+
+
+@dataclass
+class PeriodicLoadOptions(ScenarioOptions):
+    """A load on both hands that swings slowly: torques of each arm beside what statics asks for.
+
+    By default the left arm is compliant and the right one under PD; `--left "" --right ""` gives both `--method`.
+    """
+
+    laws: tyro.conf.OmitArgPrefixes[LawOptions] = field(
+        default_factory=lambda: LawOptions(left="cotap:alpha=0.7,stiffness=500", right="pd")
+    )
+    protocol: tyro.conf.OmitArgPrefixes[PeriodicLoad] = field(default_factory=PeriodicLoad)
+
+
+@dataclass
+class PunchesOptions(ScenarioOptions):
+    """A walk over waypoints while the arms take punches: who arrives."""
+
+    protocol: tyro.conf.OmitArgPrefixes[PunchWalk] = field(default_factory=PunchWalk)
+
+
+@dataclass
+class FallCurveOptions(ScenarioOptions):
+    """Fall rate against impulse, and the impulse at which half of the worlds fall."""
+
+    protocol: tyro.conf.OmitArgPrefixes[FallCurve] = field(default_factory=FallCurve)
+
+
+@dataclass
+class ModulationOptions(ScenarioOptions):
+    """Stiffness and blend stepped and ramped over their whole range: falls, torque, energy."""
+
+    laws: tyro.conf.OmitArgPrefixes[LawOptions] = field(default_factory=lambda: LawOptions(method="cotap"))
+    protocol: tyro.conf.OmitArgPrefixes[Modulation] = field(default_factory=Modulation)
 
 
 def main(argv: list[str] | None = None) -> int:
     """Parse, evaluate, report. Returns the exit status: 0, or 2 for bad input."""
     args = list(sys.argv[1:] if argv is None else argv)
+    if not args or args[0] in ("-h", "--help"):
+        print(f"usage: python -m cotap.evaluate PROTOCOL [options]; protocols: {', '.join(PROTOCOLS)}")
+        return 0 if args else 2
     try:
-        if not args or args[0] in ("-h", "--help"):
-            print(f"usage: python -m cotap.evaluate PROTOCOL [options]; protocols: {', '.join(PROTOCOLS)}")
-            return 0 if args else 2
-        require_one_of("protocol", args[0], PROTOCOLS.keys())
-        kind, run = PROTOCOLS[args[0]]
-        run(tyro.cli(kind, args=args[1:], prog=f"python -m cotap.evaluate {args[0]}"))
+        evaluate(args)
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     return 0
 
 
-def _prepare(options: CommonOptions, protocol: Any, outputs: tuple[str, ...]) -> tuple[H1Env, Policy, str]:
+def evaluate(args: list[str]) -> dict[str, Any]:
+    """As `python -m cotap.evaluate`, for callers who want the result.
+
+    Raises:
+        ValueError: bad input; the message names it.
+        OSError: an output cannot be written.
+    """
+    require_one_of("protocol", args[0], PROTOCOLS.keys())
+    kind, run = PROTOCOLS[args[0]]
+    return run(tyro.cli(kind, args=args[1:], prog=f"python -m cotap.evaluate {args[0]}"))
+
+
+def _prepare(options: CommonOptions, protocol: Any) -> tuple[H1Env, Policy, str]:
     """The policy, and the environment that the protocol makes of the one it was trained in."""
     import torch
 
     from cotap.agents.checkpoint import require_layout, sha256
     from cotap.envs import H1Env, H1EnvConfig
-    from cotap.evaluation.policy import load_policy, shipped_checkpoint
+    from cotap.evaluation.policy import load_policy
 
     protocol.check()
     upper_body = options.laws.configure()
-    for name in outputs:
-        _require_folder(name, getattr(options, name))
+    upper_body.singularity_ratio = options.singularity_ratio
+    for name in ("json", "plot", "video"):
+        _require_folder(name, getattr(options, name, ""))
     if options.threads:
         torch.set_num_threads(options.threads)
-    path = options.checkpoint or shipped_checkpoint("base")
+    path = _checkpoint(options)
     policy = load_policy(path)
     torch.manual_seed(protocol.seed)
     cfg: H1EnvConfig = protocol.configure(from_plain(H1EnvConfig, policy.config["training"]["env"]))
@@ -111,28 +185,47 @@ def _prepare(options: CommonOptions, protocol: Any, outputs: tuple[str, ...]) ->
     return env, policy, sha256(path)
 
 
+def _checkpoint(options: CommonOptions) -> Path:
+    """The file that the options mean."""
+    from cotap.evaluation.policy import CHECKPOINTS, default_checkpoint, shipped_checkpoint
+
+    if options.checkpoint in CHECKPOINTS:
+        return shipped_checkpoint(options.checkpoint)
+    if options.checkpoint:
+        return Path(options.checkpoint)
+    return shipped_checkpoint("base") if isinstance(options, VelocityTrackingOptions) else default_checkpoint()
+
+
 def _result(name: str, options: CommonOptions, protocol: Any, env: H1Env, checkpoint: str) -> dict[str, Any]:
     """The head of an evaluation's JSON."""
     settings = to_plain(protocol) | to_plain(options.laws)
     return {
         "protocol": name,
-        "method": options.laws.method,
+        "method": _method(env),
         "settings": {**settings, "checkpoint_sha256": checkpoint, "env": to_plain(env.cfg)},
         "num_envs": protocol.num_envs,
         "num_diverged": env.num_diverged,
     }
 
 
+def _method(env: H1Env) -> str:
+    """The arms' law; of two that differ, both."""
+    laws = {arm.side: env.cfg.upper_body.of(arm.side).name for arm in env.spec.arms}
+    return ", ".join(f"{side} {law}" for side, law in laws.items()) if len(set(laws.values())) > 1 else laws["left"]
+
+
 def velocity_tracking(options: VelocityTrackingOptions) -> dict[str, Any]:
     """Evaluate, print the table, write what was asked for, and return the result."""
+    import torch
+
     from cotap.agents.checkpoint import write_json
     from cotap.envs import H1EnvConfig
-    from cotap.evaluation.metrics import summarize, tracking_measures, tracking_slopes
+    from cotap.evaluation.metrics import summaries, tracking_measures, tracking_slopes
     from cotap.evaluation.report import plot_tracking, table
     from cotap.evaluation.rollout import record_rollout
 
     protocol = options.protocol
-    env, policy, checkpoint = _prepare(options, protocol, ("json", "plot", "video"))
+    env, policy, checkpoint = _prepare(options, protocol)
     if not protocol.arm_motion:
         env.motions.hold(env.motions.default)
     start = time.perf_counter()
@@ -141,7 +234,7 @@ def velocity_tracking(options: VelocityTrackingOptions) -> dict[str, Any]:
     gait = env.cfg.commands.gait_period_s
     measures = tracking_measures(trajectory, gait, protocol.settle_seconds)
     stood = ~trajectory.fell.any(0)
-    metrics = {name: summarize(value, protocol.seed) for name, value in measures.items()}
+    metrics = summaries(measures, torch.ones_like(stood), protocol.seed)
     slopes = tracking_slopes(trajectory, gait, protocol.settle_seconds)
     result = _result("velocity-tracking", options, protocol, env, checkpoint) | {
         "num_falls": int(trajectory.fell.any(0).sum()),
@@ -151,7 +244,7 @@ def velocity_tracking(options: VelocityTrackingOptions) -> dict[str, Any]:
         "episode_length_fraction": metrics["episode_length_fraction"]["mean"],
         "slopes": {name: None if math.isnan(value) else value for name, value in slopes.items()},
         "metrics": metrics,
-        "metrics_without_falls": {name: summarize(value[stood], protocol.seed) for name, value in measures.items()},
+        "metrics_without_falls": summaries(measures, stood, protocol.seed),
         "window": {"start": 0.0, "end": protocol.episode_seconds},
     }
     print(table(result))
@@ -173,7 +266,7 @@ def static_stiffness(options: StaticStiffnessOptions) -> dict[str, Any]:
     from cotap.evaluation.static import measure, plot, summary, table
 
     protocol = options.protocol
-    env, policy, checkpoint = _prepare(options, protocol, ("json", "plot"))
+    env, policy, checkpoint = _prepare(options, protocol)
     law = env.cfg.upper_body.of(protocol.hand)
     commanded = law.stiffness if law.name == "cotap" else None
     start = time.perf_counter()
@@ -192,46 +285,102 @@ def static_stiffness(options: StaticStiffnessOptions) -> dict[str, Any]:
     return result
 
 
-def disturbance(name: str, options: ImpactOptions | ConstantLoadOptions) -> dict[str, Any]:
+def fidelity(options: FidelityOptions) -> dict[str, Any]:
     """Measure, print the table, write what was asked for, and return the result."""
     from cotap.agents.checkpoint import write_json
-    from cotap.evaluation.disturbance import curve, disturbance_measures, plot
-    from cotap.evaluation.metrics import summarize
-    from cotap.evaluation.report import table
-    from cotap.evaluation.rollout import record_rollout
+    from cotap.evaluation.fidelity import measure, plot, summary, table
 
     protocol = options.protocol
-    env, policy, checkpoint = _prepare(options, protocol, ("json", "plot"))
-    protocol.command(env)
+    env, policy, checkpoint = _prepare(options, protocol)
+    if env.cfg.upper_body.of(protocol.hand).name in ("pd", "soft-pd"):
+        raise ValueError("fidelity needs a law with a stiffness at the hand, such as --method cotap")
     start = time.perf_counter()
-    steps = round(protocol.seconds / env.dt)
-    trajectory = record_rollout(env, policy, steps, arm_actions=protocol.arm_actions)
-    seconds = time.perf_counter() - start
-    sides = tuple(arm.side for arm in env.spec.arms)
-    measures = disturbance_measures(trajectory, protocol, sides)
-    stood = ~trajectory.fell.any(0)
-    curves = curve(trajectory, protocol, sides)
-    result = _result(name, options, protocol, env, checkpoint) | {
-        "num_falls": int((~stood).sum()),
-        "seconds": seconds,
-        "metrics": {key: summarize(value, protocol.seed) for key, value in measures.items()},
-        "metrics_without_falls": {key: summarize(value[stood], protocol.seed) for key, value in measures.items()},
-        "window": {"start": protocol.onset + protocol.window[0], "end": protocol.onset + protocol.window[1]},
-        "curve": curves,
+    measured, coverage = measure(env, protocol, policy)
+    result = _result("fidelity", options, protocol, env, checkpoint) | {
+        "num_falls": int(measured.fell.sum()),
+        "seconds": time.perf_counter() - start,
+        **summary(measured, coverage, protocol),
+        "window": {"start": 2.0 * protocol.settle_seconds - 1.0, "end": 2.0 * protocol.settle_seconds},
     }
     print(table(result))
     if options.json:
         write_json(Path(options.json), result)
     if options.plot:
-        plot(Path(options.plot), curves, f"{name}, {protocol.mode}, {options.laws.method}")
+        plot(Path(options.plot), result)
+    return result
+
+
+def pictures(args: list[str], times: tuple[float, ...], width: int = 480, height: int = 480) -> list[np.ndarray]:
+    """Pictures (height, width, 3) of the first world of a protocol that disturbs it, at these times [s].
+
+    Args:
+        args: As for `evaluate`.
+        times: Within the evaluation [s].
+        width: [pixels].
+        height: [pixels].
+
+    Raises:
+        ValueError: bad input; the message names it.
+        RenderingUnavailable: there is no OpenGL to be had.
+    """
+    from cotap.evaluation.render import film_frames
+    from cotap.evaluation.rollout import record_rollout
+
+    kind, _ = PROTOCOLS[require_one_of("protocol", args[0], PROTOCOLS.keys())]
+    options = tyro.cli(kind, args=args[1:])
+    protocol = options.protocol
+    env, policy, _ = _prepare(options, protocol)
+    protocol.prepare(env)
+    steps = round(max(times) / env.dt)
+    trajectory = record_rollout(
+        env, policy, steps, arm_actions=protocol.arm_actions, before_step=protocol.before_step, film=True
+    )
+    rows = [min(max(round(time / env.dt) - 1, 0), steps - 1) for time in times]
+    return list(film_frames(env, trajectory.film[rows], width, height))
+
+
+def scenario(name: str, options: ScenarioOptions) -> dict[str, Any]:
+    """Run, print the table, write what was asked for, and return the result."""
+    from cotap.agents.checkpoint import write_json
+    from cotap.evaluation.report import table
+    from cotap.evaluation.rollout import idle, record_rollout
+
+    protocol = options.protocol
+    env, policy, checkpoint = _prepare(options, protocol)
+    protocol.prepare(env)
+    start = time.perf_counter()
+    trajectory = record_rollout(
+        env, idle(env) if env.cfg.fixed_base else policy, round(protocol.seconds / env.dt),
+        arm_actions=protocol.arm_actions, before_step=protocol.before_step, film=bool(options.video),
+    )  # fmt: skip
+    measured = protocol.measure(trajectory, env)
+    result = _result(name, options, protocol, env, checkpoint) | {
+        "num_falls": int(trajectory.fell.any(0).sum()),
+        "seconds": time.perf_counter() - start,
+        **measured,
+    }
+    print(table(result))
+    if options.json:
+        write_json(Path(options.json), result)
+    if options.plot:
+        protocol.plot(Path(options.plot), result)
+    if options.video:
+        from cotap.evaluation.render import film_video
+
+        film_video(Path(options.video), env, trajectory.film, Path(options.video).with_suffix(".png"))
     return result
 
 
 PROTOCOLS: dict[str, tuple[type[Any], Callable[[Any], dict[str, Any]]]] = {
     "velocity-tracking": (VelocityTrackingOptions, velocity_tracking),
     "static-stiffness": (StaticStiffnessOptions, static_stiffness),
-    "impact": (ImpactOptions, partial(disturbance, "impact")),
-    "constant-load": (ConstantLoadOptions, partial(disturbance, "constant-load")),
+    "fidelity": (FidelityOptions, fidelity),
+    "impact": (ImpactOptions, partial(scenario, "impact")),
+    "constant-load": (ConstantLoadOptions, partial(scenario, "constant-load")),
+    "periodic-load": (PeriodicLoadOptions, partial(scenario, "periodic-load")),
+    "punches": (PunchesOptions, partial(scenario, "punches")),
+    "fall-curve": (FallCurveOptions, partial(scenario, "fall-curve")),
+    "modulation": (ModulationOptions, partial(scenario, "modulation")),
 }
 """Every protocol's options and what runs it."""
 

@@ -12,6 +12,7 @@ from cotap.evaluation.metrics import (
     settled,
     slope,
     steps_since_change,
+    summaries,
     summarize,
     swing_heights,
     tracking_measures,
@@ -38,13 +39,15 @@ def trajectory(steps: int = 200, worlds: int = 2, **changes: torch.Tensor) -> Tr
         "arm_velocity": torch.zeros(steps, worlds, 8),
         "arm_torque": torch.zeros(steps, worlds, 8),
         "arm_at_limit": torch.zeros(steps, worlds, dtype=torch.bool),
-        "hand_position": torch.zeros(steps, worlds, 2, 3),
+        "arm_static_torque": torch.zeros(steps, worlds, 8),
+        "hand_offset": torch.zeros(steps, worlds, 2, 3),
         "hand_error": torch.zeros(steps, worlds, 2),
         "foot_contact": torch.ones(steps, worlds, 2, dtype=torch.bool),
         "foot_speed": torch.zeros(steps, worlds, 2),
         "foot_height": torch.zeros(steps, worlds, 2),
         "path_error": torch.full((steps, worlds), math.nan),
         "fell": torch.zeros(steps, worlds, dtype=torch.bool),
+        "film": torch.zeros(0, 0),
     }
     return Trajectory(dt=DT, **(fields | changes))
 
@@ -195,6 +198,21 @@ def test_summary_interval_covers_the_mean_at_its_stated_rate():
     assert 87 <= hits <= 100
     s = summarize(torch.tensor([1.0, 3.0, math.nan]))
     assert (s["mean"], s["std"]) == (2.0, pytest.approx(math.sqrt(2.0)))
+
+
+def test_events_get_wilsons_interval():
+    """Against published values: 0 of 10 is 0 to 0.278, 81 of 263 is 0.255 to 0.366."""
+    none = summarize(torch.zeros(10, dtype=torch.bool))
+    assert (none["mean"], none["n"]) == (0.0, 10)
+    assert none["ci95"] == pytest.approx([0.0, 0.2775], abs=1e-3)
+    assert summarize(torch.arange(263) < 81)["ci95"] == pytest.approx([0.2553, 0.3662], abs=1e-3)
+    assert summarize(torch.ones(10, dtype=torch.bool))["ci95"][1] == 1.0
+
+
+def test_summary_counts_who_was_measured():
+    assert summarize(torch.tensor([1.0, 3.0, math.nan]))["n"] == 2
+    keep = torch.tensor([True, False, True])
+    assert summaries({"x": torch.tensor([1.0, 50.0, 3.0])}, keep, 0)["x"]["mean"] == 2.0
 
 
 def test_what_cannot_be_measured_is_null_with_a_reason():

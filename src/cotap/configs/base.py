@@ -76,6 +76,28 @@ def robust(training: BaseTraining | None = None) -> BaseTraining:
     return training
 
 
-BASE_RECIPES: dict[str, Callable[[], BaseTraining]] = {"default": default, "paper": paper, "robust": robust}
+def torque_critic() -> BaseTraining:
+    """Ablation: the arms' torque is seen by the critics only (paper, appendix C)."""
+    training = default()
+    training.env.observations.arm_torque = "critic"
+    return training
+
+
+def goals() -> BaseTraining:
+    """Ablation: actors see the arms' commanded stiffness and alpha, which vary although PD does not heed them yet."""
+    training = default()
+    training.env.observations.goals = True
+    training.env.upper_body.sampling.enabled = True
+    return training
+
+
+BASE_RECIPES: dict[str, Callable[[], BaseTraining]] = {
+    "default": default,
+    "paper": paper,
+    "robust": robust,
+    "torque-critic": torque_critic,
+    "goals": goals,
+}
+"""Stage 1, by name."""
 CONTINUATIONS: dict[str, Callable[[BaseTraining], BaseTraining]] = {"robust": robust}
 """Recipes that may also go on from a checkpoint, and then change its config."""

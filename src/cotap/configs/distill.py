@@ -54,4 +54,38 @@ def paper(base: BaseTraining) -> DistillTraining:
     return training
 
 
-DISTILL_RECIPES: dict[str, Callable[[BaseTraining], DistillTraining]] = {"default": default, "paper": paper}
+def no_ratio(base: BaseTraining) -> DistillTraining:
+    """Ablation: compliance does not give way to PD near singular arms (paper, Table IV)."""
+    training = default(base)
+    training.env.upper_body.singularity_ratio = False
+    return training
+
+
+def torque_critic(base: BaseTraining) -> DistillTraining:
+    """Ablation: the arms' torque is seen by the critics only. Raises ValueError for a base that was not trained so."""
+    _require_base("torque-critic", base.env.observations.arm_torque == "critic")
+    return default(base)
+
+
+def goals(base: BaseTraining) -> DistillTraining:
+    """Ablation: actors see stiffness and alpha as commanded. Raises ValueError for a base that was not trained so."""
+    _require_base("goals", base.env.observations.goals)
+    return default(base)
+
+
+def _require_base(recipe: str, fits: bool) -> None:
+    if not fits:
+        raise ValueError(
+            f"recipe {recipe!r} changes the observation: it needs --base-checkpoint with a base of the same recipe "
+            f"(python -m cotap.train base --recipe {recipe})"
+        )
+
+
+DISTILL_RECIPES: dict[str, Callable[[BaseTraining], DistillTraining]] = {
+    "default": default,
+    "paper": paper,
+    "no-ratio": no_ratio,
+    "torque-critic": torque_critic,
+    "goals": goals,
+}
+"""Stage 2, by name."""

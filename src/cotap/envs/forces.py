@@ -1,4 +1,4 @@
-"""Forces on the hands that follow a script: held, struck or swinging, the same profile for every protocol."""
+"""Forces on hands or base that follow a script: held, struck or swinging, one profile for every protocol."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from cotap.checks import require_finite, require_one_of, require_range
 from cotap.envs.persistence import Stateful
 
 HANDS = ("left", "right", "both")
+PLACES = ("hand", "base")
 
 
 @dataclass
 class ForceProfile:
-    """A force on one hand or both, in the heading frame, from a moment on and for a while."""
+    """A force on one hand or both, or on the base, in the heading frame, from a moment on and for a while."""
 
     force: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Along x, y and z [N]; zero for none."""
@@ -29,10 +30,13 @@ class ForceProfile:
     """0 for a constant force; otherwise it swings as a sine with this period [s]."""
     random_direction: bool = False
     """Turn the force about the vertical by a random angle, drawn per world and episode."""
+    place: str = "hand"
+    """hand, or base: at the base's centre of mass (H1's pelvis), and on no hand."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
         require_one_of("force.hand", self.hand, HANDS)
+        require_one_of("force.place", self.place, PLACES)
         for i, value in enumerate(self.force):
             require_finite(f"force.force[{i}]", value)
         require_range("force.start_s", self.start_s, 0.0, 1e6)
@@ -41,16 +45,18 @@ class ForceProfile:
 
 
 class ScriptedForces(Stateful):
-    """`ForceProfile` in N worlds. `amplitude_h` (N, H, 3) may be written to, for worlds that differ."""
+    """`ForceProfile` in N worlds. `amplitude_h` (N, H + 1, 3), hands first, then the base, may be written to, for
+    worlds that differ."""
 
     STATE = ("amplitude_h",)
 
-    def __init__(self, cfg: ForceProfile, sides: tuple[str, ...], num_envs: int) -> None:
+    def __init__(self, cfg: ForceProfile, sides: tuple[str, ...], num_envs: int, dt: float) -> None:
         cfg.check()
-        self.cfg = cfg
+        self.cfg, self._dt = cfg, dt
         self.active = any(cfg.force)
         """Whether there is any force at all."""
-        pushed = torch.tensor([cfg.hand in (side, "both") for side in sides])
+        at_hand = cfg.place == "hand"
+        pushed = torch.tensor([*(at_hand and cfg.hand in (side, "both") for side in sides), not at_hand])
         self.amplitude_h = (pushed[:, None] * torch.tensor(cfg.force)).repeat(num_envs, 1, 1)
 
     def reset(self, mask: torch.Tensor, rng: torch.Generator) -> None:
@@ -64,11 +70,16 @@ class ScriptedForces(Stateful):
         self.amplitude_h[mask] = torch.stack((c * x - s * y, s * x + c * y, z), -1)
 
     def at(self, time_s: torch.Tensor) -> torch.Tensor:
-        """Forces (N, H, 3) [N], heading frame, at times (N,) [s] since each world's start."""
+        """Forces (N, H + 1, 3) [N] on hands and base, heading frame.
+
+        They are means over the control steps that begin at `time_s` (N,) since each world's start [s], so that the
+        impulse is exact whatever the step.
+        """
         since = time_s - self.cfg.start_s
-        # A control step begins at its time; rounding must not cost it its first or add another.
-        on = (since > -1e-4) & (since < self.cfg.duration_s - 1e-4)
-        share = on.float()
+        end = (since + self._dt).clamp(0.0, self.cfg.duration_s)
+        share = (end - since.clamp(0.0, self.cfg.duration_s)) / self._dt
+        # Times are rounded; a force must neither miss its first step nor linger in one more.
+        share = (1e4 * share).round() / 1e4
         if self.cfg.period_s > 0.0:
             share = share * torch.sin(2.0 * math.pi * since / self.cfg.period_s)
         return share[:, None, None] * self.amplitude_h

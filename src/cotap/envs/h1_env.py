@@ -19,6 +19,7 @@ from cotap.envs.forces import ForceProfile, ScriptedForces
 from cotap.envs.gait import StepMotion, desired_contact, swing_progress
 from cotap.envs.impedance import ImpedanceConfig, PathFollower
 from cotap.envs.observations import (
+    GOALS_PER_ARM,
     ObservationConfig,
     ObservationHistory,
     actor_terms,
@@ -26,6 +27,7 @@ from cotap.envs.observations import (
     noise_amplitude,
 )
 from cotap.envs.persistence import uniform
+from cotap.envs.punches import PunchConfig, Punches
 from cotap.envs.randomization import RandomizationConfig, Randomizer
 from cotap.envs.reference import ReferenceConfig, ReferenceMotion
 from cotap.envs.rewards import LowerRewards, RewardGroup, StepRecord, UpperRewards, check_weights
@@ -36,6 +38,7 @@ from cotap.envs.terminations import TerminationConfig, diverged, fallen
 from cotap.envs.upper_body import UpperBody, UpperBodyConfig
 from cotap.reflection import Symmetry
 from cotap.robots import ROBOTS
+from cotap.robots.ground import HALF_EXTENT_M
 from cotap.robots.mjcf import COLLISIONS, FIXED_BASE_LIFT_M, build_model
 from cotap.rotations import quat_about_z, quat_from_matrix, rotate
 from cotap.sim import DelayedTargets, Simulation, Snapshot
@@ -109,6 +112,8 @@ class H1EnvConfig:
     """Factor on the robot's torque limits."""
     fixed_base: bool = False
     """Hold the base in the air: for measurements on the arms alone."""
+    unevenness_m: float = 0.0
+    """Height of the ground's bumps from lowest to highest [m]; 0 is flat. Worlds start at different places on it."""
     actions: ActionConfig = field(default_factory=ActionConfig)
     upper_body: UpperBodyConfig = field(default_factory=UpperBodyConfig)
     observations: ObservationConfig = field(default_factory=ObservationConfig)
@@ -121,6 +126,7 @@ class H1EnvConfig:
     hand_forces: HandForceConfig = field(default_factory=HandForceConfig)
     blows: BlowConfig = field(default_factory=BlowConfig)
     force: ForceProfile = field(default_factory=ForceProfile)
+    punches: PunchConfig = field(default_factory=PunchConfig)
     assist: AssistConfig = field(default_factory=AssistConfig)
 
     def check(self) -> None:
@@ -131,9 +137,10 @@ class H1EnvConfig:
         require_one_of("collision", self.collision, COLLISIONS)
         require_range("control_dt", self.control_dt, 1e-4, 1.0)
         require_range("torque_limit_scale", self.torque_limit_scale, 1e-3, 1e3)
+        require_range("unevenness_m", self.unevenness_m, 0.0, 0.2)
         for part in (
             self.actions, self.upper_body, self.observations, self.commands, self.motions, self.impedance,
-            self.terminations, self.hand_forces, self.blows, self.force, self.assist,
+            self.terminations, self.hand_forces, self.blows, self.force, self.punches, self.assist,
         ):  # fmt: skip
             part.check()
         self.randomization.check(self.control_dt)
@@ -170,7 +177,7 @@ class H1Env(VecEnv):
         self.action_slices = {"lower": slice(0, self.num_lower), "upper": slice(self.num_lower, self.num_actions)}
         self.rng = torch.Generator().manual_seed(cfg.seed)
 
-        model = build_model(spec, cfg.collision, cfg.control_dt / cfg.substeps, cfg.fixed_base)
+        model = build_model(spec, cfg.collision, cfg.control_dt / cfg.substeps, cfg.fixed_base, cfg.unevenness_m)
         model.actuator_forcerange[:] *= cfg.torque_limit_scale
         self.sim = Simulation(model, n, cfg.substeps, cfg.num_threads, Randomizer.FIELDS)
         self.dt = self.sim.dt
@@ -196,6 +203,8 @@ class H1Env(VecEnv):
         self.reader = StateReader(spec, self.sim)
         self.arm_limits = self.reader.arm_joints(self._torque_limit.unsqueeze(0))[0]
         self._hand_bodies = [model.body(arm.hand_body).id for arm in spec.arms]
+        self._arm_links = [b for arm in spec.arms for b in spec.chain(arm.hand_body, spec.torso_body)]
+        self._arm_bodies = [model.body(link.name).id for link in self._arm_links]
         self._hand_lever = torch.stack(
             [torch.tensor(a.hand_point) - torch.tensor(spec.body(a.hand_body).com) for a in spec.arms]
         )
@@ -210,16 +219,20 @@ class H1Env(VecEnv):
         self.path = PathFollower(cfg.impedance, n, self.dt)
         self.hand_forces = HandForces(cfg.hand_forces, n, len(spec.arms), self.dt)
         self.blows = Blows(cfg.blows, n, len(spec.arms), self.dt)
-        self.scripted = ScriptedForces(cfg.force, tuple(arm.side for arm in spec.arms), n)
+        self.scripted = ScriptedForces(cfg.force, tuple(arm.side for arm in spec.arms), n, self.dt)
+        self.punches = Punches(cfg.punches, n, self.num_actions - self.num_lower, self.dt)
         self.assistance = Assistance(cfg.assist, n, self.dt)
         self.randomizer = Randomizer(cfg.randomization, spec, self.sim)
         self.upper_body = UpperBody(cfg.upper_body, spec, n)
         self.targets = DelayedTargets(n, self.num_actions, cfg.substeps, self.dt)
-        terms = actor_terms(self.num_actions, self.num_actions - self.num_lower)
+        num_upper, sees = self.num_actions - self.num_lower, cfg.observations.arm_torque == "actor"
+        goals = GOALS_PER_ARM * len(spec.arms) * cfg.observations.goals
+        terms = actor_terms(self.num_actions, num_upper, sees, goals)
+        self._critic_terms = critic_terms(len(spec.arms), 0 if sees else num_upper)
         self.history = ObservationHistory(terms, n, cfg.observations.history)
         self._clean_history = ObservationHistory(terms, n, cfg.observations.history)
         self._noise = noise_amplitude(terms, cfg.observations.noise)
-        self._critic_scale = torch.cat([torch.full((w,), s) for _, w, s in critic_terms(len(spec.arms))])
+        self._critic_scale = torch.cat([torch.full((w,), s) for _, w, s in self._critic_terms])
         self._groups = (
             RewardGroup("lower", cfg.rewards.lower, self.dt),
             RewardGroup("upper", cfg.rewards.upper, self.dt),
@@ -243,11 +256,16 @@ class H1Env(VecEnv):
         return {"actor": ["policy"], "critic": ["clean" if noisy else "policy", "privileged"]}
 
     @property
+    def hand_force_w(self) -> torch.Tensor:
+        """(N, H, 3) force at each hand in the last step, world frame [N]."""
+        return self._hand_force_w
+
+    @property
     def symmetry(self) -> Symmetry:
         """The mirror images of observations and actions."""
         terms, steps = self.history.terms, self.history.steps
         actor = actor_reflection(self.spec, terms, steps)
-        critic = critic_reflection(self.spec, critic_terms(len(self.spec.arms)))
+        critic = critic_reflection(self.spec, self._critic_terms)
         return Symmetry(
             {"policy": actor, "clean": actor, "privileged": critic}, joint_reflection(self.spec, self.spec.joint_names)
         )
@@ -260,7 +278,7 @@ class H1Env(VecEnv):
             "joints": list(self.spec.joint_names),
             "terms": [list(t) for t in self.history.terms],
             "history": self.history.steps,
-            "critic_terms": [list(t) for t in critic_terms(len(self.spec.arms))],
+            "critic_terms": [list(t) for t in self._critic_terms],
             "actions": asdict(c.actions),
             "control_dt": c.control_dt,
         }
@@ -309,6 +327,7 @@ class H1Env(VecEnv):
         self._follow_path()
         self.upper_body.step(self.dt, self.rng)
         self.hand_forces.step(self.rng)
+        self.punches.step(self.rng)
 
         fell = fallen(self.cfg.terminations, self.state.height, self.state.projected_gravity_t) | bad
         self.assistance.step(fell, self.samples)
@@ -400,6 +419,7 @@ class H1Env(VecEnv):
             "hand_forces": self.hand_forces,
             "blows": self.blows,
             "scripted": self.scripted,
+            "punches": self.punches,
             "assistance": self.assistance,
             "randomizer": self.randomizer,
             "history": self.history,
@@ -443,12 +463,16 @@ class H1Env(VecEnv):
         if self.cfg.blows.enabled:
             force_h = force_h + self.blows.current()
         if self.scripted.active:
-            force_h = force_h + self.scripted.at(self.dt * self.episode_length_buf)
+            scripted_h = self.scripted.at(self.dt * self.episode_length_buf)
+            force_h = force_h + scripted_h[:, :-1]
+            self.sim.xfrc[:, self._base_body, :3] = rotate(s.heading_w, scripted_h[:, -1]).double()
         self._hand_force_w = (s.heading_w.unsqueeze(1) @ force_h.unsqueeze(-1)).squeeze(-1)
         hand_rotation_w = s.torso_rotation_w.unsqueeze(1) @ s.arms.rotation
         lever_w = rotate(hand_rotation_w, self._hand_lever)
         for i, body in enumerate(self._hand_bodies):
             self.sim.apply_force(body, self._hand_force_w[:, i], lever_w[:, i])
+        if self.punches.active:
+            self._punch()
         share = self.assistance.share(self.samples)
         if self.cfg.assist.enabled:
             command = self.commands.current()
@@ -459,6 +483,18 @@ class H1Env(VecEnv):
                 command.yaw_rate - s.yaw_rate, command.height - s.height, s.torso_linear_velocity_h[:, 2],
             )  # fmt: skip
             self.sim.xfrc[:, self._base_body] = share * torch.cat((force, torque), 1).double()
+
+    def _punch(self) -> None:
+        """Add the blows on the arms' joints to what acts on the links already."""
+        s = self.state
+        rotations_w = (s.torso_rotation_w[:, None, None] @ s.arms.rotations).flatten(1, 2)
+        blows_w = self.punches.current()
+        for i, link in enumerate(self._arm_links):
+            # The joint is the origin of the link's frame.
+            lever_w = -rotate(rotations_w[:, i], torch.tensor(link.com))
+            wrench = torch.cat((blows_w[:, i], torch.linalg.cross(lever_w, blows_w[:, i])), 1).double()
+            body = self._arm_bodies[i]
+            self.sim.xfrc[:, body] = wrench + (self.sim.xfrc[:, body] if body in self._hand_bodies else 0.0)
 
     def _record(self, action: torch.Tensor, velocity_before: torch.Tensor, fell: torch.Tensor) -> StepRecord:
         s, command, reference = self.state, self.commands.current(), self.motions.current()
@@ -591,10 +627,14 @@ class H1Env(VecEnv):
         self.hand_forces.reset(mask, self.rng)
         self.blows.reset(mask, self.rng)
         self.scripted.reset(mask, self.rng)
+        self.punches.reset(mask, self.rng)
         joints = self._default + uniform(self.rng, -0.05, 0.05, n, self.num_actions)
         joints[:, self.num_lower :] = self.motions.current().position[mask]
         position = torch.zeros(n, 3)
         position[:, 2] = self.spec.nominal_height_m + (FIXED_BASE_LIFT_M if self.cfg.fixed_base else 0.01)
+        if self.cfg.unevenness_m > 0.0:
+            position[:, :2] = uniform(self.rng, -0.5 * HALF_EXTENT_M, 0.5 * HALF_EXTENT_M, n, 2)
+            position[:, 2] += 0.5 * self.cfg.unevenness_m
         yaw = uniform(self.rng, -math.pi, math.pi, n) * (not self.cfg.fixed_base)
         qpos = torch.cat((position, quat_about_z(yaw), joints), 1)
         qvel = torch.cat((uniform(self.rng, -0.05, 0.05, n, 6), torch.zeros(n, self.num_actions)), 1)
@@ -611,28 +651,41 @@ class H1Env(VecEnv):
         """Append the present to the history of every world and assemble the observation groups."""
         s, c = self.state, self.commands.current()
         angle, walking = 2.0 * math.pi * c.phase, 1.0 - c.stand
+        torque = self.joint_torque(s)[:, self.num_lower :]
+        actor_sees = self.cfg.observations.arm_torque == "actor"
         present = torch.cat(
             (
                 s.torso_angular_velocity_t, s.projected_gravity_t, c.velocity_h, c.yaw_rate.unsqueeze(1),
                 c.stand.unsqueeze(1), c.height.unsqueeze(1), self.motions.current().position,
                 s.joint_pos - self._default, s.joint_vel, self._last_action,
                 (walking * angle.sin()).unsqueeze(1), (walking * angle.cos()).unsqueeze(1),
-                self.joint_torque(s)[:, self.num_lower :],
+                *((torque,) if actor_sees else ()), *((self._goals(),) if self.cfg.observations.goals else ()),
             ),
             1,
         )  # fmt: skip
         present = present * self.history.scale
-        groups = {"privileged": self._privileged(s) * self._critic_scale}
+        groups = {"privileged": self._privileged(s, None if actor_sees else torque) * self._critic_scale}
         if self.cfg.observations.noise.enabled:
             groups["clean"] = self._clean_history.append(present, restarted)
             present = present + self._noise * uniform(self.rng, -1.0, 1.0, *present.shape)
         groups["policy"] = self.history.append(present, restarted)
         self._observations = TensorDict(groups, batch_size=[self.num_envs])
 
-    def _privileged(self, s: RobotState) -> torch.Tensor:
+    def _goals(self) -> torch.Tensor:
+        """What the arms' laws are asked for, (N, 5 A), of the order of one."""
+        p = self.upper_body.parameters
+        stiffness, null = (p.stiffness / 300.0).log(), (p.null_stiffness / 40.0).log()
+        return torch.cat((stiffness, null.unsqueeze(2), p.alpha.unsqueeze(2)), 2).flatten(1)
+
+    def _privileged(self, s: RobotState, torque: torch.Tensor | None) -> torch.Tensor:
+        """What only critics see; with arm torque (N, U) where actors do not."""
         return torch.cat(
-            (quat_from_matrix(s.torso_rotation_w), s.torso_linear_velocity_h, self._hand_force_w.flatten(1)), 1
-        )
+            (
+                quat_from_matrix(s.torso_rotation_w), s.torso_linear_velocity_h,
+                *(() if torque is None else (torque,)), self._hand_force_w.flatten(1),
+            ),
+            1,
+        )  # fmt: skip
 
 
 def _mean(values: torch.Tensor) -> torch.Tensor:

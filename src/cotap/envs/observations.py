@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import torch
 
-from cotap.checks import require_range
+from cotap.checks import require_one_of, require_range
 from cotap.envs.persistence import Stateful
 
 
@@ -32,11 +32,16 @@ class ObservationConfig:
 
     history: int = 5
     """Steps of history, the present one included."""
+    arm_torque: str = "actor"
+    """Who sees the arms' torque: actor (and so the critic), or critic alone (the paper's ablation)."""
+    goals: bool = False
+    """Whether the actor sees the arms' stiffness, null-space stiffness and alpha as they are commanded."""
     noise: NoiseConfig = field(default_factory=NoiseConfig)
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
         require_range("observations.history", self.history, 1, 100)
+        require_one_of("observations.arm_torque", self.arm_torque, ("actor", "critic"))
         for name in ("angular_velocity", "gravity", "joint_position", "joint_velocity"):
             require_range(f"observations.noise.{name}", getattr(self.noise, name), 0.0, 100.0)
 
@@ -45,9 +50,13 @@ Term = tuple[str, int, float]
 """Name, width and scale."""
 
 
-def actor_terms(num_joints: int, num_upper: int) -> tuple[Term, ...]:
+GOALS_PER_ARM = 5
+"""Logarithms of stiffness along x, y and z and of null-space stiffness, and alpha."""
+
+
+def actor_terms(num_joints: int, num_upper: int, arm_torque: bool = True, num_goals: int = 0) -> tuple[Term, ...]:
     """Terms of one step of the actor's observation, in order."""
-    return (
+    terms: list[Term] = [
         ("torso_angular_velocity", 3, 0.25),
         ("projected_gravity", 3, 1.0),
         ("command_velocity", 2, 1.0),
@@ -60,15 +69,20 @@ def actor_terms(num_joints: int, num_upper: int) -> tuple[Term, ...]:
         ("last_action", num_joints, 1.0),
         ("sin_phase", 1, 1.0),
         ("cos_phase", 1, 1.0),
-        ("arm_torque", num_upper, 1.0),
-    )
+    ]
+    if arm_torque:
+        terms.append(("arm_torque", num_upper, 1.0))
+    if num_goals:
+        terms.append(("goals", num_goals, 1.0))
+    return tuple(terms)
 
 
-def critic_terms(num_hands: int) -> tuple[Term, ...]:
-    """Terms that only the critic sees, for the present step."""
+def critic_terms(num_hands: int, num_torques: int = 0) -> tuple[Term, ...]:
+    """Terms that only the critic sees, for the present step; `num_torques` arm torques that the actor does not."""
     return (
         ("torso_orientation", 4, 1.0),
         ("torso_linear_velocity", 3, 2.0),
+        *((("arm_torque", num_torques, 1.0),) if num_torques else ()),
         *((f"hand_force_{i}", 3, 0.1) for i in range(num_hands)),
     )
 

@@ -39,7 +39,17 @@ def _term_reflection(spec: RobotSpec, name: str, width: int) -> Reflection:
         return joint_reflection(spec, spec.joint_names)
     if name in ("reference_arm_position", "arm_torque"):
         return joint_reflection(spec, spec.upper_joints)
+    if name == "goals":  # diagonal stiffness is its own mirror image; arms change places
+        arms = torch.arange(width).unflatten(0, (len(spec.arms), -1))
+        return Reflection(arms[_swapped_arms(spec)].flatten(), torch.ones(width))
     return Reflection(torch.arange(width), torch.tensor(_SIGNS[name]))
+
+
+def _swapped_arms(spec: RobotSpec) -> torch.Tensor:
+    """Which arm each arm becomes."""
+    swap = {"left": "right", "right": "left"}
+    sides = [arm.side for arm in spec.arms]
+    return torch.tensor([sides.index(swap[s]) for s in sides])
 
 
 def actor_reflection(spec: RobotSpec, terms: tuple[Term, ...], history: int) -> Reflection:
@@ -49,11 +59,9 @@ def actor_reflection(spec: RobotSpec, terms: tuple[Term, ...], history: int) -> 
 
 def critic_reflection(spec: RobotSpec, terms: tuple[Term, ...]) -> Reflection:
     """Of what only the critic sees. Hands change places."""
-    swap = {"left": "right", "right": "left"}
-    sides = [arm.side for arm in spec.arms]
     body = [t for t in terms if not t[0].startswith("hand_force")]
     parts = [_term_reflection(spec, name, width) for name, width, _ in body]
     hands = Reflection(
-        torch.cat([3 * sides.index(swap[s]) + torch.arange(3) for s in sides]), torch.tensor(_VECTOR * len(sides))
+        (3 * _swapped_arms(spec).unsqueeze(1) + torch.arange(3)).flatten(), torch.tensor(_VECTOR * len(spec.arms))
     )
     return join([*parts, hands])

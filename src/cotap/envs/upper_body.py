@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
 
 from cotap.checks import require_interval, require_one_of, require_range
+from cotap.compliance import singularity_aware_ratio
 from cotap.compliance.laws import LAWS, Arms, ArmState, LawConfig, LawParameters, TorqueLaw
 from cotap.compliance.torso import chain_compliance, hand_base_compliance, torso_compliance
 from cotap.envs.persistence import Stateful, uniform
@@ -72,6 +73,8 @@ class UpperBodyConfig:
     right: LawConfig = field(default_factory=LawConfig)
     torso: TorsoComplianceConfig = field(default_factory=TorsoComplianceConfig)
     sampling: LawSampling = field(default_factory=LawSampling)
+    singularity_ratio: bool = True
+    """Whether compliance gives way to PD near singular arms (paper, equation 9); False for its ablation."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
@@ -97,7 +100,7 @@ class UpperBody(Stateful):
     def __init__(self, cfg: UpperBodyConfig, spec: RobotSpec, num_envs: int) -> None:
         cfg.check()
         self._cfg, self._spec = cfg, spec
-        chains = arm_chains(spec)
+        self._chains = chains = arm_chains(spec)
         arms = Arms(chains, arm_inertias(spec), *arm_gains(spec))
         configs = [cfg.of(arm.side) for arm in spec.arms]
         self.active = any(c.name != "pd" for c in configs)
@@ -126,12 +129,12 @@ class UpperBody(Stateful):
     def reset(self, mask: torch.Tensor, rng: torch.Generator) -> None:
         """The next command of the worlds in `mask` has none before it; their parameters are drawn anew."""
         self.fresh = self.fresh | mask
-        if self.active and self._cfg.sampling.enabled:
+        if self._cfg.sampling.enabled:
             self._sample(mask, rng)
 
     def step(self, dt: float, rng: torch.Generator) -> None:
         """Advance the clock of the parameters by one control step."""
-        if self.active and self._cfg.sampling.enabled:
+        if self._cfg.sampling.enabled:
             self._hold_s = self._hold_s - dt
             self._sample(self._hold_s <= 0.0, rng)
 
@@ -211,12 +214,19 @@ class UpperBody(Stateful):
             self._damping[which],
         )
 
+    def _undiminished(self, arms: ArmState) -> LawParameters:
+        """The parameters, alpha raised by what the laws will take off it for a singularity."""
+        one = torch.ones_like(self.parameters.alpha, dtype=torch.float64)
+        left = singularity_aware_ratio(one, self._chains.jacobian(arms.pose).double())
+        return replace(self.parameters, alpha=(self.parameters.alpha / left).float())
+
     def _ask(self, arms: ArmState) -> tuple[TorqueLaw, dict[str, torch.Tensor]]:
         """Every law for all arms; each arm keeps its own's answer."""
         merged: TorqueLaw | None = None
         log: dict[str, torch.Tensor] = {}
+        parameters = self.parameters if self._cfg.singularity_ratio else self._undiminished(arms)
         for law, mine in self._laws:
-            answer, report = law(arms, self.parameters)
+            answer, report = law(arms, parameters)
             log.update({f"/law/{k}": v[:, mine].mean() for k, v in report.values.items()})
             merged = answer if merged is None else _choose(mine, answer, merged)
         assert merged is not None

@@ -3,100 +3,139 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from cotap.agents.checkpoint import write_atomically
-from cotap.checks import require_one_of, require_positive_int, require_range
+from cotap.checks import require_range
 from cotap.envs import H1Env, H1EnvConfig
-from cotap.envs.commands import STEADY_RAD
 from cotap.envs.forces import ForceProfile
-from cotap.evaluation.metrics import masked_mean
+from cotap.evaluation.metrics import masked_mean, summaries
+from cotap.evaluation.report import save_figure
 from cotap.evaluation.rollout import Trajectory
+from cotap.evaluation.scenario import Scenario
 
-MODES = ("stance", "walking")
+BEFORE_S = 0.5
+"""What a hand does in this time before the onset is what it is compared with afterwards [s]."""
 
 
 @dataclass
-class Impact:
+class Impact(Scenario):
     """A blow on a hand: 500 N for 50 ms."""
 
-    num_envs: int = 1024
-    """Number of worlds."""
-    seed: int = 0
-    """Seed of worlds, directions and bootstrap."""
-    mode: str = "stance"
-    """stance, or walking forward at `speed`."""
-    speed: float = 0.5
-    """Forward command while walking [m/s]."""
     force: tuple[float, float, float] = (500.0, 0.0, 0.0)
     """Along x, y and z of the heading frame [N]."""
     hand: str = "left"
     """left, right or both."""
+    place: str = "hand"
+    """hand, or base: an unannounced push on the pelvis and on no hand."""
     duration: float = 0.05
     """How long the force lasts [s]."""
     random_direction: bool = False
     """Turn the force about the vertical by a random angle."""
-    onset: float = 3.0
+    onset: float = 1.0
     """When it sets in [s]."""
     window: tuple[float, float] = (0.0, 1.0)
     """What is measured, from the onset [s]."""
-    motion: tuple[str, ...] = ()
-    """Clips that the arms follow; empty holds the default pose."""
-    steady_rad: float = STEADY_RAD
-    """A standing robot that is leaning further than this, or is about to, steps in place until it is steady [rad]."""
-    arm_actions: bool = True
-    """Let the policy's own residual move the arms."""
-    randomize: bool = True
-    """Domain randomisation."""
-    torque_limit_scale: float = 1.0
-    """Factor on the robot's torque limits."""
+    episode_seconds: float = 3.0
+    """Length of the evaluation [s]."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
-        require_positive_int("num_envs", self.num_envs)
-        require_one_of("mode", self.mode, MODES)
-        require_range("speed", self.speed, -5.0, 5.0)
-        require_range("onset", self.onset, 1.0, 3600.0)
+        super().check()
+        require_range("onset", self.onset, BEFORE_S, 3600.0)
         require_range("window[0]", self.window[0], 0.0, 3600.0)
         require_range("window[1]", self.window[1], self.window[0] + 0.02, 3600.0)
-        require_range("steady_rad", self.steady_rad, 0.0, 10.0)
-        require_range("torque_limit_scale", self.torque_limit_scale, 1e-3, 1e6)
+        require_range("episode_seconds", self.episode_seconds, self.onset + self.window[1], 1e4)
         self._profile().check()
 
     def _profile(self) -> ForceProfile:
-        return ForceProfile(self.force, self.hand, self.onset, self.duration, 0.0, self.random_direction)
+        return ForceProfile(
+            self.force, self.hand, self.onset, self.duration, 0.0, self.random_direction, self.place
+        )  # fmt: skip
 
     @property
     def seconds(self) -> float:
         """Length of the evaluation [s]."""
-        return self.onset + self.window[1]
+        return self.episode_seconds
 
     def configure(self, env: H1EnvConfig) -> H1EnvConfig:
         """Turn the environment that a policy was trained in into this protocol's. Changes and returns `env`."""
-        self.check()
-        env.num_envs, env.seed, env.torque_limit_scale = self.num_envs, self.seed, self.torque_limit_scale
-        env.assist.enabled = env.hand_forces.enabled = env.blows.enabled = env.observations.noise.enabled = False
-        env.randomization.enabled = self.randomize
-        env.terminations.episode_s = 1e6
-        env.impedance.share, env.commands.steady_rad = 0.0, self.steady_rad
         env.force = self._profile()
-        clips = env.motions.clips
-        clips.share, clips.only, clips.held_out = (1.0, self.motion, ()) if self.motion else (0.0, (), ())
-        return env
+        return super().configure(env)
 
-    def command(self, env: H1Env) -> None:
-        """Give every world the mode's command, and its arms the default pose unless they follow clips."""
-        n = env.num_envs
-        walking = self.mode == "walking"
-        velocity = torch.tensor([self.speed if walking else 0.0, 0.0]).repeat(n, 1)
-        stand = torch.full((n,), 0.0 if walking else 1.0)
-        env.commands.override(velocity, torch.zeros(n), stand, torch.full((n,), env.spec.nominal_height_m))
-        if not self.motion:
-            env.motions.hold(env.motions.default)
+    def hit(self, env: H1Env) -> list[int]:
+        """Indices of the hands whose error is `e_ee_hit`: those that the force is on, all for a force on the base."""
+        return [i for i, a in enumerate(env.spec.arms) if self.place == "base" or self.hand in (a.side, "both")]
+
+    def measure(self, trajectory: Trajectory, env: H1Env) -> dict[str, Any]:
+        """The measured part of the evaluation's JSON."""
+        t, hit = trajectory, self.hit(env)
+        onset = round(self.onset / t.dt)
+        begin, end = (onset + round(bound / t.dt) for bound in self.window)
+        stood = ~t.fell.any(0)
+        everyone = torch.ones_like(stood)
+        window = window_measures(t, begin, end, hit)
+        if any(self.force):
+            window |= response_measures(t, onset, begin, end, hit)
+        episode = window_measures(t, 0, len(t.fell), hit)
+        return {
+            "falls": falls_by_time(t, onset, end),
+            "metrics": summaries(window, everyone, self.seed),
+            "metrics_without_falls": summaries(window, stood, self.seed),
+            "window": {"start": self.onset + self.window[0], "end": self.onset + self.window[1]},
+            "episode": {
+                "metrics": summaries(episode, everyone, self.seed),
+                "metrics_without_falls": summaries(episode, stood, self.seed),
+                "window": {"start": 0.0, "end": self.seconds},
+            },
+            "curve": curve(t, onset, hit),
+        } | self._stiffness(env, window, stood)
+
+    def _stiffness(self, env: H1Env, measures: dict[str, torch.Tensor], stood: torch.Tensor) -> dict[str, Any]:
+        """Force over displacement, where the load is held and is the same in all worlds."""
+        law = env.cfg.upper_body.of(env.spec.arms[self.hit(env)[0]].side)
+        commanded = list(law.stiffness) if law.name not in ("pd", "soft-pd") else None
+        reason = ""
+        if self.place != "hand" or not any(self.force):
+            reason = "no hand is loaded"
+        elif self.duration < self.window[1]:
+            reason = "the force is over before the window is"
+        elif self.random_direction:
+            reason = "the force's direction differs between worlds"
+        if reason:
+            return {"effective_stiffness": {"commanded": commanded, "measured": None, "reason": reason}}
+        measured: list[float | None] = []
+        for force, axis in zip(self.force, "xyz", strict=True):
+            moved = summaries({"d": measures[f"displacement_{axis}"]}, stood, self.seed)["d"]
+            low, high = moved["ci95"] or (0.0, 0.0)
+            measured.append(force / float(moved["mean"] or 0.0) if force != 0.0 and low * high > 0.0 else None)
+        out = {"commanded": commanded, "measured": measured}
+        if None in measured:
+            out["reason"] = "null: no force along that axis, or a displacement that cannot be told from zero"
+        return {"effective_stiffness": out}
+
+    def plot(self, path: Path, result: dict[str, Any]) -> None:
+        """Hand error, torso velocity error and arm torque over time, means over the worlds that stood."""
+        import matplotlib
+
+        matplotlib.use("Agg")
+        import matplotlib.pyplot as plt
+
+        curves = result["curve"]
+        panels = (("hand_error", "hand error [m]"), ("torso_velocity_error", "torso velocity error [m/s]"),
+                  ("arm_torque", "arm torque, 2-norm [Nm]"))  # fmt: skip
+        figure, axes = plt.subplots(1, 3, figsize=(12, 3.4), constrained_layout=True)
+        for axis, (name, label) in zip(axes, panels, strict=True):
+            if curves["time"]:
+                axis.plot(curves["time"], curves[name], color="#2171b5")
+            axis.axvline(0.0, color="0.6", lw=0.8)
+            axis.set(xlabel="time since the force set in [s]", ylabel=label)
+            axis.grid(alpha=0.2)
+        figure.suptitle(f"{result['protocol']}, {self.mode}, {result['method']}")
+        save_figure(figure, path)
 
 
 @dataclass
@@ -109,88 +148,94 @@ class ConstantLoad(Impact):
     """How long the force lasts [s]."""
     window: tuple[float, float] = (2.0, 4.0)
     """What is measured, from the onset [s]."""
+    episode_seconds: float = 5.0
+    """Length of the evaluation [s]."""
 
 
-def disturbance_measures(t: Trajectory, protocol: Impact, sides: tuple[str, ...]) -> dict[str, torch.Tensor]:
-    """Measures of the window per world, (N,) each, up to a fall; NaN where there is nothing to measure.
+def window_measures(t: Trajectory, begin: int, end: int, hit: list[int]) -> dict[str, torch.Tensor]:
+    """Measures of the steps from `begin` to before `end` per world, (N,) each, up to a fall; NaN for a world with none.
 
-    Hand errors are against the reference carried in the torso frame; `e_ee_hit` is that of the disturbed hands.
+    Hand errors are against the reference carried in the torso frame; `e_ee_hit` is that of the hands in `hit`. Torques
+    are those at the ends of control steps, `peak_torque` the largest of any arm joint, `energy` the integral of
+    |torque x rate| over all arm joints.
     """
-    onset = round(protocol.onset / t.dt)
-    begin, end = (onset + round(bound / t.dt) for bound in protocol.window)
-    part = replace(t, **{name: getattr(t, name)[begin:end] for name in _TENSORS})
+    part = replace(t, **{f.name: getattr(t, f.name)[begin:end] for f in fields(t) if f.name != "dt"})
     alive = t.alive()[begin:end]
-    hit = [i for i, side in enumerate(sides) if protocol.hand in (side, "both")]
-    hit_error = t.hand_error[..., hit].mean(2)
     torque = part.arm_torque.norm(dim=2)
     power = (part.arm_torque * part.arm_velocity).abs().sum(2)
-    fell = t.fell.any(0)
+    error = (part.velocity - part.command)[..., :2]
+    seen = alive.any(0)
+    nothing = torch.full(seen.shape, math.nan)
+    peak = torch.where(alive, part.arm_torque.abs().amax(2), torch.zeros_like(torque)).amax(0)
+    energy = torch.where(alive, power, torch.zeros_like(power)).sum(0) * t.dt
     return {
-        "e_torso": masked_mean((part.velocity - part.command)[..., :2].norm(dim=2), alive),
+        "e_torso": masked_mean(error.norm(dim=2), alive),
+        **{f"e_torso_{axis}": masked_mean(error[..., i].abs(), alive) for i, axis in enumerate("xy")},
         "e_ee": masked_mean(part.hand_error.mean(2), alive),
-        "e_ee_hit": masked_mean(hit_error[begin:end], alive),
+        "e_ee_hit": masked_mean(part.hand_error[..., hit].mean(2), alive),
         "j_upper": masked_mean(torque, alive),
         "e_upper": masked_mean(part.arm_error.norm(dim=2), alive),
-        "peak_torque": torch.where(alive, part.arm_torque.abs().amax(2), torch.zeros_like(torque)).amax(0),
+        "peak_torque": torch.where(seen, peak, nothing),
         "share_at_limit": masked_mean(part.arm_at_limit.float(), alive),
-        "energy": torch.where(alive, power, torch.zeros_like(power)).sum(0) * t.dt,
-        "recovery_s": recovery_time(hit_error, t.alive(), onset, t.dt),
-        "fall_fraction": fell.float(),
+        "energy": torch.where(seen, energy, nothing),
+        "fall_fraction": t.fell[:end].any(0),
     }
 
 
-_TENSORS = ("velocity", "command", "hand_error", "arm_torque", "arm_velocity", "arm_error", "arm_at_limit")
+def response_measures(t: Trajectory, onset: int, begin: int, end: int, hit: list[int]) -> dict[str, torch.Tensor]:
+    """How far the hands in `hit` went and how soon they were back, per world, (N,) each.
 
-
-def recovery_time(error: torch.Tensor, alive: torch.Tensor, onset: int, dt: float) -> torch.Tensor:
-    """Seconds (N,) from the onset until `error` (T, N) is back under 1.5 times its mean of the half second before.
-
-    NaN where it never leaves, never comes back within the record, or the robot falls.
+    Displacements are means over the window of the hand's offset from its reference, less that of the half second
+    before the onset; NaN for a world that fell before the window's end.
     """
-    before = error[max(0, onset - round(0.5 / dt)) : onset].mean(0)
+    before = t.hand_offset[onset - round(BEFORE_S / t.dt) : onset][:, :, hit].mean((0, 2))
+    moved = t.hand_offset[begin:end][:, :, hit].mean((0, 2)) - before
+    upright = t.alive()[end - 1].unsqueeze(1)
+    moved = torch.where(upright, moved, torch.full_like(moved, math.nan))
+    seconds, recovered = recovery(t.hand_error[..., hit].mean(2), t.alive(), onset, t.dt)
+    return {
+        "recovery_s": seconds,
+        "recovered_fraction": recovered,
+        **{f"displacement_{axis}": moved[:, i] for i, axis in enumerate("xyz")},
+    }
+
+
+def recovery(error: torch.Tensor, alive: torch.Tensor, onset: int, dt: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """When `error` (T, N) is back for good under 1.5 times its mean of the half second before the onset.
+
+    Returns:
+        Seconds (N,) from the onset, NaN where it never leaves, never comes back within the record, or the robot falls;
+        and whether (N,) the robot stands and the error is back, or never left, by the record's end.
+    """
+    before = error[onset - round(BEFORE_S / dt) : onset].mean(0)
     over = error[onset:] > 1.5 * before
     left = over.any(0)
     last = torch.where(over, torch.arange(over.shape[0]).unsqueeze(1), -1).amax(0)
-    back = left & (last < over.shape[0] - 1) & alive.all(0)
-    return torch.where(back, (last + 1).float() * dt, torch.full_like(before, math.nan))
+    back = (last < over.shape[0] - 1) & alive.all(0)
+    return torch.where(back & left, (last + 1).float() * dt, torch.full_like(before, math.nan)), back
 
 
-def curve(t: Trajectory, protocol: Impact, sides: tuple[str, ...]) -> dict[str, list[float | None]]:
-    """Mean over standing worlds of what happens over time, from a second before the onset."""
-    onset = round(protocol.onset / t.dt)
-    begin = onset - round(1.0 / t.dt)
+def falls_by_time(t: Trajectory, onset: int, end: int) -> dict[str, int]:
+    """How many worlds fell first before the step `onset`, from there to before `end`, and later."""
+    before, within, ever = (t.fell[:k].any(0) for k in (onset, end, len(t.fell)))
+    counts = (before, within & ~before, ever & ~within)
+    return dict(zip(("before_onset", "to_window_end", "later"), (int(c.sum()) for c in counts), strict=True))
+
+
+def curve(t: Trajectory, onset: int, hit: list[int]) -> dict[str, list[float]]:
+    """Mean over standing worlds of what happens over time, from up to a second before the onset."""
+    begin = max(0, onset - round(1.0 / t.dt))
     stood = ~t.fell.any(0)
-    hit = [i for i, side in enumerate(sides) if protocol.hand in (side, "both")]
     if not stood.any():
         return {"time": []}
+    offset = t.hand_offset[begin:, stood][:, :, hit].mean((1, 2))
+    velocity = (t.velocity - t.command)[begin:, stood]
     rows = {
-        "time": (torch.arange(begin, len(t.fell)) - onset) * t.dt,
+        "time": (torch.arange(begin, len(t.fell)) - onset + 1) * t.dt,
         "hand_error": t.hand_error[begin:, stood][..., hit].mean((1, 2)),
-        "hand_displacement_z": (t.hand_position[begin:, stood] - t.hand_position[onset - 1, stood])[:, :, hit, 2].mean(
-            (1, 2)
-        ),
-        "torso_velocity_error": (t.velocity - t.command)[begin:, stood, :2].norm(dim=2).mean(1),
+        **{f"hand_displacement_{axis}": offset[:, i] - offset[onset - 1 - begin, i] for i, axis in enumerate("xyz")},
+        "torso_velocity_error": velocity[..., :2].norm(dim=2).mean(1),
+        **{f"velocity_error_{axis}": velocity[..., i].mean(1) for i, axis in enumerate("xy")},
         "arm_torque": t.arm_torque[begin:, stood].norm(dim=2).mean(1),
     }
     return {name: values.tolist() for name, values in rows.items()}
-
-
-def plot(path: Path, curves: dict[str, Any], title: str) -> None:
-    """Hand error, torso velocity error and arm torque over time, means over the worlds that stood."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    panels = (("hand_error", "hand error [m]"), ("torso_velocity_error", "torso velocity error [m/s]"),
-              ("arm_torque", "arm torque, 2-norm [Nm]"))  # fmt: skip
-    figure, axes = plt.subplots(1, 3, figsize=(12, 3.4), constrained_layout=True)
-    for axis, (name, label) in zip(axes, panels, strict=True):
-        if curves["time"]:
-            axis.plot(curves["time"], curves[name], color="#2171b5")
-        axis.axvline(0.0, color="0.6", lw=0.8)
-        axis.set(xlabel="time since the force set in [s]", ylabel=label)
-        axis.grid(alpha=0.2)
-    figure.suptitle(title)
-    write_atomically(path, lambda p: figure.savefig(p, dpi=130, format=path.suffix.lstrip(".") or "png"))
-    plt.close(figure)

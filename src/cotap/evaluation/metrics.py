@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -98,7 +99,7 @@ def tracking_measures(t: Trajectory, gait_period_s: float, settle_s: float = 1.0
         "foot_slip": torch.where(contact.any(2).any(0), slip, torch.full_like(slip, math.nan)),
         "swing_height": swing_heights(t.foot_height, t.foot_contact, ok & walking, round(0.1 / t.dt)),
         "e_path": masked_mean(t.path_error, t.alive() & torch.isfinite(t.path_error)),
-        "fall_fraction": t.fell.any(0).float(),
+        "fall_fraction": t.fell.any(0),
         "episode_length_fraction": t.alive().float().mean(0),
     }
 
@@ -111,16 +112,41 @@ def tracking_slopes(t: Trajectory, gait_period_s: float, settle_s: float = 1.0) 
 
 
 def summarize(values: torch.Tensor, seed: int = 0, resamples: int = 1000) -> dict[str, Any]:
-    """Mean, standard deviation and bootstrap 95 % interval of the mean over worlds; NaN worlds are left out.
+    """Mean, standard deviation and 95 % interval of the mean over worlds, and the number of worlds `n` behind them.
 
-    Where nothing could be measured the numbers are null and `reason` says so.
+    Numbers (N,) get a bootstrap interval, NaN worlds left out. Events (N,) bool get Wilson's, which has a width even
+    where all worlds agree. Where nothing could be measured the numbers are null and `reason` says so.
     """
-    finite = values[torch.isfinite(values)].double()
-    n = finite.numel()
+    counted = values[torch.isfinite(values)].double()
+    n = counted.numel()
     if n == 0:
-        return {"mean": None, "std": None, "ci95": None, "reason": "no world had anything to measure"}
+        return {"mean": None, "std": None, "ci95": None, "n": 0, "reason": "no world had anything to measure"}
+    mean, std = float(counted.mean()), float(counted.std()) if n > 1 else 0.0
+    if values.dtype == torch.bool:
+        return {"mean": mean, "std": std, "ci95": list(wilson_interval(mean, n)), "n": n}
+    means = (_resamples(n, seed, resamples) @ counted.float()) / n
+    low, high = torch.quantile(means.double(), torch.tensor([0.025, 0.975], dtype=torch.float64)).tolist()
+    # Single precision may put the interval of equal numbers beside them by a rounding.
+    return {"mean": mean, "std": std, "ci95": [min(low, mean), max(high, mean)], "n": n}
+
+
+def summaries(measures: dict[str, torch.Tensor], keep: torch.Tensor, seed: int) -> dict[str, dict[str, Any]]:
+    """Every measure (N,) summed up over the worlds in `keep` (N,)."""
+    return {name: summarize(values[keep], seed) for name, values in measures.items()}
+
+
+def wilson_interval(share: float, n: int) -> tuple[float, float]:
+    """95 % interval of a share that was seen in `n` trials (Wilson 1927)."""
+    z = 1.959964
+    center = (share + z * z / (2 * n)) / (1 + z * z / n)
+    half = z / (1 + z * z / n) * math.sqrt(share * (1.0 - share) / n + z * z / (4 * n * n))
+    # At a share of 0 or 1 the interval ends there; rounding must not leave it short.
+    return (0.0 if share == 0.0 else center - half), (1.0 if share == 1.0 else center + half)
+
+
+@lru_cache(maxsize=4)
+def _resamples(n: int, seed: int, resamples: int) -> torch.Tensor:
+    """How often each of `n` worlds is drawn in each bootstrap sample, (resamples, n)."""
     rng = torch.Generator().manual_seed(seed)
-    means = torch.stack([finite[torch.randint(0, n, (n,), generator=rng)].mean() for _ in range(resamples)])
-    low, high = torch.quantile(means, torch.tensor([0.025, 0.975], dtype=torch.float64)).tolist()
-    std = float(finite.std()) if n > 1 else 0.0
-    return {"mean": float(finite.mean()), "std": std, "ci95": [low, high]}
+    draws = (torch.randint(0, n, (n,), generator=rng) for _ in range(resamples))
+    return torch.stack([torch.bincount(draw, minlength=n) for draw in draws]).float()

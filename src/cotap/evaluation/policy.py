@@ -13,13 +13,32 @@ from cotap.agents.actors import AgentLayout, DualActorCritic
 from cotap.agents.checkpoint import CheckpointError, load_checkpoint
 from cotap.checks import require_one_of
 
-SHIPPED = {"base": "base.pt"}
+CHECKPOINTS = ("base", "cotap", "cotap-no-ratio", "cotap-torque-critic", "cotap-goals")
+"""Names under which checkpoints are shipped: both stages, and the second stage's ablations."""
 
 
-def shipped_checkpoint(stage: str = "base") -> Path:
-    """Path of the checkpoint that comes with the package. Raises ValueError for an unknown stage."""
-    require_one_of("stage", stage, SHIPPED.keys())
-    return Path(str(files("cotap").joinpath("checkpoints", SHIPPED[stage])))
+def checkpoint_path(name: str) -> Path:
+    """Where the package has, or would have, the checkpoint of this name. Raises ValueError for an unknown one."""
+    require_one_of("checkpoint", name, CHECKPOINTS)
+    return Path(str(files("cotap").joinpath("checkpoints", f"{name}.pt")))
+
+
+def shipped_names() -> list[str]:
+    """The checkpoints that come with this package."""
+    return [name for name in CHECKPOINTS if checkpoint_path(name).is_file()]
+
+
+def shipped_checkpoint(name: str = "base") -> Path:
+    """Path of a checkpoint that comes with the package. Raises ValueError for one that does not."""
+    path = checkpoint_path(name)
+    if not path.is_file():
+        raise ValueError(f"checkpoint {name!r} is not shipped; shipped are: {', '.join(shipped_names())}")
+    return path
+
+
+def default_checkpoint() -> Path:
+    """What compliance is evaluated with: the distilled policy if it is shipped, else the base."""
+    return shipped_checkpoint("cotap" if "cotap" in shipped_names() else "base")
 
 
 @dataclass(frozen=True)

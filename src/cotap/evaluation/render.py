@@ -70,6 +70,68 @@ def render_frames(
             yield renderer.render().copy()
 
 
+REFERENCE_RGBA = (0.15, 0.35, 0.9, 1.0)
+FORCE_RGBA = (0.85, 0.1, 0.1, 1.0)
+FORCE_SCALE_M_PER_N = 0.006
+LONGEST_ARROW_M = 0.8
+
+
+def film_frames(
+    env: H1Env, film: torch.Tensor, width: int = 640, height: int = 480, camera: str = "track"
+) -> Iterator[np.ndarray]:
+    """Images (height, width, 3) uint8 of a film (T, nq + 6 H) of `record_rollout`.
+
+    Blue balls are the hands' references, red arrows the forces, which point at the hands.
+    """
+    model = build_model(env.spec, unevenness_m=env.cfg.unevenness_m)
+    data = mujoco.MjData(model)
+    sides = [arm.side for arm in env.spec.arms]
+    with open_renderer(model, width, height) as renderer:
+        for row in film.double().numpy():
+            data.qpos[:] = row[: model.nq]
+            mujoco.mj_forward(model, data)
+            renderer.update_scene(data, camera)
+            points, forces = row[model.nq :].reshape(2, len(sides), 3)
+            for side, point, force in zip(sides, points, forces, strict=True):
+                _add_ball(renderer.scene, point)
+                if np.linalg.norm(force) > 0.0:
+                    _add_arrow(renderer.scene, data.site(f"{side}_hand").xpos, force)
+            yield renderer.render().copy()
+
+
+def _add_ball(scene: mujoco.MjvScene, center: np.ndarray) -> None:
+    scene.ngeom += 1
+    mujoco.mjv_initGeom(
+        scene.geoms[scene.ngeom - 1], mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, 0.035), center, np.eye(3).ravel(),
+        np.array(REFERENCE_RGBA, dtype=np.float32),
+    )  # fmt: skip
+
+
+def _add_arrow(scene: mujoco.MjvScene, tip: np.ndarray, force: np.ndarray) -> None:
+    size = np.linalg.norm(force)
+    tail = tip - force / size * min(FORCE_SCALE_M_PER_N * size, LONGEST_ARROW_M)
+    scene.ngeom += 1
+    geom = scene.geoms[scene.ngeom - 1]
+    mujoco.mjv_initGeom(
+        geom, mujoco.mjtGeom.mjGEOM_ARROW, np.zeros(3), np.zeros(3), np.eye(3).ravel(),
+        np.array(FORCE_RGBA, dtype=np.float32),
+    )  # fmt: skip
+    mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_ARROW, 0.02, tail, tip)
+
+
+def film_video(path: Path, env: H1Env, film: torch.Tensor, sheet: Path | None = None) -> None:
+    """Write a video (and a contact sheet) of a film.
+
+    Raises:
+        RenderingUnavailable: there is no OpenGL to be had.
+    """
+    stride = 2
+    frames = list(film_frames(env, film[::stride]))
+    write_video(path, iter(frames), 1.0 / (env.dt * stride))
+    if sheet is not None:
+        contact_sheet(sheet, frames[:: max(1, len(frames) // 24)][:24], 6)
+
+
 def write_video(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
     """Write frames as MP4, atomically."""
     import imageio.v2 as imageio

@@ -14,8 +14,19 @@ from cotap.evaluation.rollout import Trajectory
 UNITS = {
     "e_lin": "m/s", "e_lin_gait": "m/s", "e_yaw": "rad/s", "e_yaw_gait": "rad/s", "e_height": "m", "e_upper": "rad",
     "e_ee": "m", "j_upper": "Nm", "stand_drift": "m/s", "foot_slip": "m/s", "swing_height": "m", "e_path": "m",
-    "e_torso": "m/s", "e_ee_hit": "m", "peak_torque": "Nm", "energy": "J", "recovery_s": "s",
+    "e_torso": "m/s", "e_torso_x": "m/s", "e_torso_y": "m/s", "e_ee_hit": "m", "peak_torque": "Nm",
+    "energy": "J", "recovery_s": "s",
+    "displacement_x": "m", "displacement_y": "m", "displacement_z": "m",
+    "seconds_upright": "s",
 }  # fmt: skip
+
+
+def save_figure(figure: Any, path: Path) -> None:
+    """Write a matplotlib figure, whole or not at all, and close it."""
+    import matplotlib.pyplot as plt
+
+    write_atomically(path, lambda p: figure.savefig(p, dpi=130, format=path.suffix.lstrip(".") or "png"))
+    plt.close(figure)
 
 
 def table(result: dict[str, Any]) -> str:
@@ -62,5 +73,4 @@ def plot_tracking(path: Path, t: Trajectory, gait_period_s: float, settle_s: flo
         axis.set_ylabel("measured")
         axis.grid(alpha=0.2)
     axes[0].legend(loc="upper left", frameon=False)
-    write_atomically(path, lambda p: figure.savefig(p, dpi=130, format=path.suffix.lstrip(".") or "png"))
-    plt.close(figure)
+    save_figure(figure, path)

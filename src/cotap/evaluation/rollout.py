@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from tqdm import tqdm
 
 from cotap.agents.actors import as_dict
+from cotap.compliance.dynamics import gravity_torque
 from cotap.envs import H1Env
+from cotap.robots.chains import arm_inertias
+from cotap.rotations import rotate_inverse
 
 PolicyFunction = Callable[[dict[str, torch.Tensor]], torch.Tensor]
 
@@ -42,10 +45,12 @@ class Trajectory:
     """(T, N, U) [Nm]."""
     arm_at_limit: torch.Tensor
     """(T, N) bool: an arm joint is at its torque limit."""
-    hand_position: torch.Tensor
-    """(T, N, H, 3) hands relative to the torso, heading frame [m]."""
+    arm_static_torque: torch.Tensor
+    """(T, N, U) what statics asks of the arms: nominal gravity at this pose, less what the hand's force does [Nm]."""
+    hand_offset: torch.Tensor
+    """(T, N, H, 3) hands relative to their reference, which the torso carries along; heading frame [m]."""
     hand_error: torch.Tensor
-    """(T, N, H) distance of the hands from their reference in the torso frame [m]."""
+    """(T, N, H) its length [m]."""
     foot_contact: torch.Tensor
     """(T, N, F) bool."""
     foot_speed: torch.Tensor
@@ -56,6 +61,9 @@ class Trajectory:
     """(T, N) horizontal distance of the torso from where its path has it [m]; NaN in worlds that follow none."""
     fell: torch.Tensor
     """(T, N) bool: the world fell in that step."""
+    film: torch.Tensor
+    """(F, nq + 6 H) the first world's configuration, its hands' references and the force on each hand, world frame;
+    F = T if it was filmed, else 0."""
 
     def alive(self) -> torch.Tensor:
         """(T, N) bool: the world has not fallen up to and including this step."""
@@ -63,25 +71,69 @@ class Trajectory:
 
 
 def record_rollout(
-    env: H1Env, policy: PolicyFunction, steps: int, progress: bool = True, arm_actions: bool = True
-) -> Trajectory:
-    """Run `policy` for `steps` control steps from a fresh start of every world, with or without its arm actions."""
+    env: H1Env, policy: PolicyFunction, steps: int, progress: bool = True, arm_actions: bool = True,
+    before_step: Callable[[H1Env, int], None] | None = None, film: bool = False,
+) -> Trajectory:  # fmt: skip
+    """Run `policy` for `steps` control steps from a fresh start of every world.
+
+    Args:
+        env: The worlds.
+        policy: Actions of observations.
+        steps: Number of control steps.
+        progress: Whether to show a progress bar.
+        arm_actions: With False, what the policy does with the arms is left out.
+        before_step: Called before every step with the environment and the step's number: commands, parameters of laws.
+        film: Whether to record what pictures of the first world need.
+    """
     obs = env.reset()
-    rows: dict[str, list[torch.Tensor]] = {f.name: [] for f in fields(Trajectory) if f.name != "dt"}
-    for _ in tqdm(range(steps), desc="rollout", unit="step", disable=not progress, leave=False):
+    gravity = ArmStatics(env)
+    record: dict[str, torch.Tensor] = {}
+    frames: list[torch.Tensor] = []
+    for step in tqdm(range(steps), desc="rollout", unit="step", disable=not progress, leave=False):
+        if before_step:
+            before_step(env, step)
         action = policy(as_dict(obs))
         if not arm_actions:
             action = action.clone()
             action[:, env.action_slices["upper"]] = 0.0
         obs, _, _, extras = env.step(action)
-        for name, value in _row(env, extras["falls"]).items():
-            rows[name].append(value)
-    return Trajectory(dt=env.dt, **{name: torch.stack(values) for name, values in rows.items()})
+        for name, value in (_row(env, extras["falls"]) | {"arm_static_torque": gravity(env)}).items():
+            record.setdefault(name, value.new_empty((steps, *value.shape)))[step] = value
+        if film:
+            frames.append(_frame(env))
+    return Trajectory(dt=env.dt, film=torch.stack(frames) if frames else torch.zeros(0, 0), **record)
+
+
+def _frame(env: H1Env) -> torch.Tensor:
+    """What a picture of the first world needs: (nq + 6 H,)."""
+    s, hands = env.record.state, len(env.spec.arms)
+    points_w = env.record.key_points_reference_t[0, :hands] @ s.torso_rotation_w[0].T + s.torso_pos_w[0]
+    return torch.cat((env.sim.qpos[0].float(), points_w.flatten(), env.hand_force_w[0].flatten()))
+
+
+def idle(env: H1Env) -> PolicyFunction:
+    """A policy that does nothing."""
+    return lambda _: torch.zeros(env.num_envs, env.num_actions)
+
+
+class ArmStatics:
+    """The torque that holds the arms of an environment's robot still under gravity and the force at each hand."""
+
+    def __init__(self, env: H1Env) -> None:
+        self._inertias = arm_inertias(env.spec)
+
+    def __call__(self, env: H1Env) -> torch.Tensor:
+        """(N, U) [Nm], after a step, for the force that acted in it."""
+        s = env.record.state
+        held = gravity_torque(self._inertias, s.arms, s.torso_rotation_w[:, 2])
+        force_t = rotate_inverse(s.torso_rotation_w.unsqueeze(1), env.hand_force_w)
+        return (held - rotate_inverse(env.reader.arm_chains.jacobian(s.arms), force_t)).flatten(1)
 
 
 def _row(env: H1Env, fell: torch.Tensor) -> dict[str, torch.Tensor]:
     r, upper = env.record, env.action_slices["upper"]
     s, hands = r.state, len(env.spec.arms)
+    offset_t = (r.key_points_t - r.key_points_reference_t)[:, :hands]
     return {
         "velocity": torch.cat((s.torso_linear_velocity_h[:, :2], s.yaw_rate.unsqueeze(1)), 1),
         "command": torch.cat((r.command.velocity_h, r.command.yaw_rate.unsqueeze(1)), 1),
@@ -94,8 +146,8 @@ def _row(env: H1Env, fell: torch.Tensor) -> dict[str, torch.Tensor]:
         "arm_velocity": s.joint_vel[:, upper],
         "arm_torque": r.torque[:, upper],
         "arm_at_limit": (r.torque[:, upper].abs() > 0.999 * env.arm_limits.flatten()).any(1),
-        "hand_position": s.arms.tip @ (s.heading_w.transpose(1, 2) @ s.torso_rotation_w).transpose(1, 2),
-        "hand_error": (r.key_points_t - r.key_points_reference_t)[:, :hands].norm(dim=2),
+        "hand_offset": offset_t @ (s.heading_w.transpose(1, 2) @ s.torso_rotation_w).transpose(1, 2),
+        "hand_error": offset_t.norm(dim=2),
         "foot_contact": s.foot_contact,
         "foot_speed": s.foot_velocity_w[:, :, :2].norm(dim=2),
         "foot_height": s.foot_pos_w[:, :, 2],

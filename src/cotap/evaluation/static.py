@@ -10,14 +10,13 @@ from typing import Any
 import torch
 
 from cotap.agents.actors import as_dict
-from cotap.agents.checkpoint import write_atomically
 from cotap.checks import require_finite, require_one_of, require_positive_int, require_range
 from cotap.compliance import condition_number
 from cotap.envs import H1Env, H1EnvConfig
 from cotap.envs.commands import STEADY_RAD
+from cotap.evaluation.report import save_figure
 from cotap.evaluation.rollout import PolicyFunction
-
-PELVIS = ("fixed", "free")
+from cotap.evaluation.scenario import PELVIS, mirrored_pose
 
 
 @dataclass
@@ -104,60 +103,76 @@ class StaticResult:
         return out
 
 
-def measure(env: H1Env, protocol: StaticStiffness, policy: PolicyFunction | None) -> StaticResult:
-    """Run the protocol in `env`, made from its config."""
-    side = [arm.side for arm in env.spec.arms].index(protocol.hand)
-    levels = torch.linspace(0.0, 1.0, protocol.levels).repeat_interleave(protocol.repeats)
-    env.scripted.amplitude_h = env.scripted.amplitude_h * levels[:, None, None]
-    env.motions.hold(_pose(env, protocol.arm_pose))
+@dataclass(frozen=True)
+class Settled:
+    """What a load that is held does to N hands."""
+
+    moved: torch.Tensor
+    """(N, 3) displacement against the torso, heading frame [m]."""
+    condition: torch.Tensor
+    """(N,) condition number of the hand's Jacobian before the load."""
+    fell: torch.Tensor
+    """(N,) bool."""
+    saturated: torch.Tensor
+    """(N,) bool: an arm joint was at its torque limit at the end."""
+
+
+def settle(env: H1Env, policy: PolicyFunction | None, seconds: float, side: int, arm_actions: bool) -> Settled:
+    """Let `env` settle for `seconds` without its scripted force, which must set in then, and again with it.
+
+    Args:
+        env: The worlds.
+        policy: Who acts; None for nobody.
+        seconds: Time before and after the force sets in, of which the last second is averaged [s].
+        side: Which hand is looked at.
+        arm_actions: Whether the policy's own arm actions count.
+    """
     obs = env.reset()
     fell = torch.zeros(env.num_envs, dtype=torch.bool)
     averages: list[torch.Tensor] = []
-    settle, window = round(protocol.settle_seconds / env.dt), round(1.0 / env.dt)
-    rotation = condition = None
-    for begin in (0, settle):  # without the load, then with it
+    steps, window = round(seconds / env.dt), round(1.0 / env.dt)
+    rotation = torch.zeros(env.num_envs, 3, 3)
+    condition = torch.zeros(env.num_envs)
+    for begin in (0, steps):  # without the load, then with it
         total = torch.zeros(env.num_envs, 3)
-        for step in range(settle):
-            action = torch.zeros(env.num_envs, env.num_actions)
-            if policy is not None and protocol.pelvis == "free":
-                action = policy(as_dict(obs)).clone()
-                if not protocol.arm_actions:
-                    action[:, env.action_slices["upper"]] = 0.0
+        for step in range(steps):
+            action = torch.zeros(env.num_envs, env.num_actions) if policy is None else policy(as_dict(obs)).clone()
+            if not arm_actions:
+                action[:, env.action_slices["upper"]] = 0.0
             obs, _, _, extras = env.step(action)
             fell |= extras["falls"]
-            if step >= settle - window:
+            if step >= steps - window:
                 total += env.record.state.arms.tip[:, side] / window
         averages.append(total)
         if begin == 0:
             s = env.state
             rotation = s.heading_w.transpose(1, 2) @ s.torso_rotation_w
             condition = condition_number(env.reader.arm_chains.jacobian(s.arms)[:, side])
-    assert rotation is not None
-    assert condition is not None
     moved = (rotation @ (averages[1] - averages[0]).unsqueeze(-1)).squeeze(-1)
-    limit = env.arm_limits[side]
     torque = env.record.torque[:, env.action_slices["upper"]].unflatten(1, (len(env.spec.arms), -1))[:, side]
+    return Settled(moved, condition, fell, (torque.abs() > 0.999 * env.arm_limits[side]).any(1))
+
+
+def measure(env: H1Env, protocol: StaticStiffness, policy: PolicyFunction | None) -> StaticResult:
+    """Run the protocol in `env`, made from its config."""
+    side = [arm.side for arm in env.spec.arms].index(protocol.hand)
+    levels = torch.linspace(0.0, 1.0, protocol.levels).repeat_interleave(protocol.repeats)
+    env.scripted.amplitude_h = env.scripted.amplitude_h * levels[:, None, None]
+    env.motions.hold(mirrored_pose(env, protocol.arm_pose))
+    settled = settle(
+        env, policy if protocol.pelvis == "free" else None, protocol.settle_seconds, side, protocol.arm_actions
+    )
     means, spreads, forces = [], [], []
     for level in range(protocol.levels):
         mine = slice(level * protocol.repeats, (level + 1) * protocol.repeats)
-        standing = moved[mine][~fell[mine]]
+        standing = settled.moved[mine][~settled.fell[mine]]
         means.append(standing.mean(0) if len(standing) else torch.full((3,), math.nan))
         spreads.append(standing.std(0) if len(standing) > 1 else torch.zeros(3))
         forces.append(env.scripted.amplitude_h[level * protocol.repeats, side])
     return StaticResult(
-        torch.stack(forces), torch.stack(means), float(condition.mean()),
-        bool((torque.abs() > 0.999 * limit).any()), int(fell.sum()), torch.stack(spreads),
+        torch.stack(forces), torch.stack(means), float(settled.condition.mean()), bool(settled.saturated.any()),
+        int(settled.fell.sum()), torch.stack(spreads),
     )  # fmt: skip
-
-
-def _pose(env: H1Env, left: tuple[float, ...]) -> torch.Tensor:
-    """Arm joints (U,) with `left` on the left arm and its mirror image on every other."""
-    by_name = {j.name: j for j in env.spec.joints}
-    values = dict(zip(env.spec.arms[0].joints, left, strict=True))
-    for name in list(values):
-        joint = by_name[name]
-        values[joint.mirror_name] = joint.mirror_sign * values[name]
-    return torch.tensor([values[n] for n in env.spec.upper_joints])
 
 
 def summary(result: StaticResult, commanded: tuple[float, ...] | None) -> dict[str, Any]:
@@ -219,5 +234,4 @@ def plot(path: Path, result: StaticResult, commanded: tuple[float, ...] | None, 
     axis.set(xlabel="displacement along the load [mm]", ylabel="force [N]")
     axis.grid(alpha=0.2)
     axis.legend(frameon=False)
-    write_atomically(path, lambda p: figure.savefig(p, dpi=130, format=path.suffix.lstrip(".") or "png"))
-    plt.close(figure)
+    save_figure(figure, path)

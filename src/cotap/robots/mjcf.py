@@ -6,6 +6,7 @@ from __future__ import annotations
 # pyright: reportAttributeAccessIssue=false
 import mujoco
 
+from cotap.robots.ground import HALF_EXTENT_M, bumps
 from cotap.robots.spec import BodySpec, GeomSpec, RobotSpec
 
 COLLISIONS = ("feet", "full")
@@ -24,9 +25,10 @@ _FLOOR, _PART = 1, 2
 
 
 def build_model(
-    spec: RobotSpec, collision: str = "feet", timestep_s: float = 0.01, fixed_base: bool = False
-) -> mujoco.MjModel:
-    """Compile `spec` on a flat floor, with a light, a following camera and foot sensors.
+    spec: RobotSpec, collision: str = "feet", timestep_s: float = 0.01, fixed_base: bool = False,
+    unevenness_m: float = 0.0,
+) -> mujoco.MjModel:  # fmt: skip
+    """Compile `spec` on a floor, with a light, a following camera and foot sensors.
 
     Actuator i drives joint i with `force = ctrl - kp q - kd dq` clipped to the torque limit: `ctrl = kp target` is PD
     control, and with zero gains it is a torque. Damping enters the integrator implicitly (implicitfast).
@@ -36,11 +38,14 @@ def build_model(
         collision: "feet" (feet against the floor) or "full" (all shapes, against the floor and each other).
         timestep_s: Physics step [s].
         fixed_base: Hold the base in the air, `FIXED_BASE_LIFT_M` above where it stands.
+        unevenness_m: Height of the ground's bumps from lowest to highest, about a height of zero; 0 is flat.
 
     Raises:
         ValueError: `collision` is unknown.
     """
     mj = build_mjspec(spec, collision, timestep_s)
+    if unevenness_m > 0.0:
+        _add_bumps(mj, unevenness_m)
     if fixed_base:
         _hold_base(mj, spec)
     return mj.compile()
@@ -79,6 +84,20 @@ def _hold_base(mj: mujoco.MjSpec, spec: RobotSpec) -> None:
     weld.name1, weld.name2 = spec.base_body, "world"
     weld.data[:] = [0.0, 0.0, 0.0, 0.0, 0.0, -(spec.nominal_height_m + FIXED_BASE_LIFT_M), 1.0, 0.0, 0.0, 0.0, 1.0]
     weld.solimp[:3] = 0.9999, 0.9999, 0.001
+
+
+def _add_bumps(mj: mujoco.MjSpec, unevenness_m: float) -> None:
+    """Bumps above a floor that is lowered to their lowest."""
+    heights = bumps()
+    rows, columns = heights.shape
+    field = mj.add_hfield(name="bumps", nrow=rows, ncol=columns, userdata=heights.ravel())
+    field.size = [HALF_EXTENT_M, HALF_EXTENT_M, unevenness_m, 0.1]
+    lowest = [0.0, 0.0, -0.5 * unevenness_m]
+    mj.geom("floor").pos = lowest
+    geom = mj.worldbody.add_geom(
+        name="bumps", type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="bumps", pos=lowest, material="grid", condim=3
+    )
+    geom.contype, geom.conaffinity = _FLOOR, _PART
 
 
 def _add_scene(mj: mujoco.MjSpec) -> None:

@@ -1,0 +1,119 @@
+"""`python -m cotap.compare A.json B.json`: what differs between two evaluations, with intervals."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+
+@dataclass
+class CompareOptions:
+    """Differences B - A of two evaluations of one protocol, with 95 % intervals."""
+
+    a: Annotated[str, tyro.conf.Positional]
+    """An evaluation's JSON."""
+    b: Annotated[str, tyro.conf.Positional]
+    """Another's."""
+    without_falls: bool = False
+    """Compare the figures of worlds that stood."""
+    json: str = ""
+    """Write the differences here."""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Parse, compare, report. Returns the exit status: 0, or 2 for bad input."""
+    options = tyro.cli(CompareOptions, args=argv, prog="python -m cotap.compare")
+    try:
+        from cotap.agents.checkpoint import write_json
+
+        result = compare(read(options.a), read(options.b), options.without_falls)
+        print(table(result))
+        if options.json:
+            write_json(Path(options.json), result)
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def read(path: str) -> dict[str, Any]:
+    """An evaluation's JSON. Raises ValueError for another file, OSError for none."""
+    try:
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
+    except ValueError as error:  # not JSON, or not text
+        raise ValueError(f"{path!r} is not JSON: {error}") from error
+    if not isinstance(content, dict) or not {"protocol", "metrics", "settings"} <= content.keys():
+        raise ValueError(f"{path!r} is not an evaluation: it lacks protocol, metrics or settings")
+    return content
+
+
+def compare(a: dict[str, Any], b: dict[str, Any], without_falls: bool = False) -> dict[str, Any]:
+    """Differences of all measures that both have, and the settings in which they differ.
+
+    The interval of a difference follows from those of its terms, taken to be independent (the square-and-add method of
+    Zou and Donner 2008, Newcombe's for shares): no more than two JSON files is needed.
+
+    Raises:
+        ValueError: the protocols differ.
+    """
+    if a["protocol"] != b["protocol"]:
+        raise ValueError(f"protocols differ: {a['protocol']!r} and {b['protocol']!r}")
+    key = "metrics_without_falls" if without_falls else "metrics"
+    rows = {name: difference(m, b[key][name]) for name, m in a.get(key, {}).items() if name in b.get(key, {})}
+    old, new = (_flat(x["settings"] | {"method": x.get("method"), "window": x.get("window")}) for x in (a, b))
+    settings = {
+        name: [old.get(name), new.get(name)]
+        for name in sorted(old.keys() | new.keys())
+        if old.get(name) != new.get(name)
+    }
+    return {"protocol": a["protocol"], "differences": rows, "settings": settings}
+
+
+def difference(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
+    """`b - a` of two summaries with `mean` and `ci95`; null with the reason where one of them is."""
+    for which, summary in (("A", a), ("B", b)):
+        if summary["mean"] is None or summary["ci95"] is None:
+            return {"a": a["mean"], "b": b["mean"], "difference": None, "ci95": None,
+                    "reason": f"{which}: {summary.get('reason', 'not measured')}"}  # fmt: skip
+    (a_low, a_high), (b_low, b_high) = a["ci95"], b["ci95"]
+    d = b["mean"] - a["mean"]
+    low = d - math.hypot(b["mean"] - b_low, a_high - a["mean"])
+    high = d + math.hypot(b_high - b["mean"], a["mean"] - a_low)
+    return {"a": a["mean"], "b": b["mean"], "difference": d, "ci95": [low, high]}
+
+
+def _flat(tree: Any, prefix: str = "") -> dict[str, Any]:
+    """Nested dicts as one, keys joined by dots."""
+    if not isinstance(tree, dict):
+        return {prefix: tree}
+    out: dict[str, Any] = {}
+    for key, value in tree.items():
+        out |= _flat(value, f"{prefix}.{key}" if prefix else str(key))
+    return out
+
+
+def table(result: dict[str, Any]) -> str:
+    """Differences as Markdown, then the settings that differ."""
+    lines = ["| measure | A | B | B - A | 95 % interval | differs |", "|---|---|---|---|---|---|"]
+    for name, row in result["differences"].items():
+        if row["difference"] is None:
+            lines.append(f"| {name} | - | - | - | {row['reason']} | |")
+            continue
+        low, high = row["ci95"]
+        differs = "yes" if low * high > 0.0 else "no"
+        lines.append(
+            f"| {name} | {row['a']:.4f} | {row['b']:.4f} | {row['difference']:+.4f} | {low:+.4f} to {high:+.4f} "
+            f"| {differs} |"
+        )
+    lines += ["", *(f"{name}: {old} -> {new}" for name, (old, new) in result["settings"].items())]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

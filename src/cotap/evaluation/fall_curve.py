@@ -1,0 +1,145 @@
+"""How hard a blow a robot survives: fall rate against impulse, and the impulse at which half of the robots fall."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from scipy.optimize import isotonic_regression
+
+from cotap.checks import require_range
+from cotap.envs import H1Env
+from cotap.evaluation.disturbance import Impact
+from cotap.evaluation.metrics import summarize
+from cotap.evaluation.report import save_figure
+from cotap.evaluation.rollout import Trajectory
+
+
+@dataclass
+class FallCurve(Impact):
+    """Blows from nothing to `impulse`, each size in as many worlds."""
+
+    force: tuple[float, float, float] = (1.0, 0.0, 0.0)
+    """Direction along x, y and z of the heading frame; its length does not count."""
+    random_direction: bool = True
+    """Turn the force about the vertical by a random angle."""
+    duration: float = 0.1
+    """How long the force lasts [s]."""
+    impulse: float = 60.0
+    """Largest impulse [N s]."""
+    levels: int = 13
+    """Number of impulses, from zero to the largest; worlds are dealt to them evenly."""
+    window: tuple[float, float] = (0.0, 3.0)
+    """What is measured, from the onset: falls later do not count [s]."""
+    episode_seconds: float = 4.0
+    """Length of the evaluation [s]."""
+
+    def check(self) -> None:
+        """Raise ValueError naming the first field that is out of its range."""
+        super().check()
+        if not any(self.force):
+            raise ValueError(f"force must not be zero along all axes, got {self.force}")
+        require_range("impulse", self.impulse, 1e-3, 1e5)
+        require_range("levels", self.levels, 2, 1000)
+        require_range("duration", self.duration, 1e-3, 100.0)
+        if self.num_envs < self.levels:
+            raise ValueError(f"num_envs must be at least levels ({self.levels}), got {self.num_envs}")
+
+    def impulses(self) -> torch.Tensor:
+        """(levels,) [N s]."""
+        return torch.linspace(0.0, self.impulse, self.levels)
+
+    def prepare(self, env: H1Env) -> None:
+        """Give every world its blow."""
+        super().prepare(env)
+        force = self.impulses()[self._level()] / (self.duration * math.hypot(*self.force))
+        env.scripted.amplitude_h = env.scripted.amplitude_h * force[:, None, None]
+
+    def _level(self) -> torch.Tensor:
+        """(N,) which impulse each world takes."""
+        return torch.arange(self.num_envs) % self.levels
+
+    def measure(self, trajectory: Trajectory, env: H1Env) -> dict[str, Any]:
+        """The measured part of the evaluation's JSON; worlds that fell before the onset are left out of the curve."""
+        common = super().measure(trajectory, env)
+        t, onset = trajectory, round(self.onset / trajectory.dt)
+        end = onset + round(self.window[1] / t.dt)
+        stood, fell = ~t.fell[:onset].any(0), t.fell[onset:end].any(0)
+        level = self._level()
+        rates = [summarize(fell[stood & (level == k)], self.seed) for k in range(self.levels)]
+        half = half_point(self.impulses(), level[stood], fell[stood], self.seed)
+        return common | {
+            "fall_curve": {"impulse": self.impulses().tolist(), "fall_rate": rates},
+            "impulse_50": half,
+        }
+
+    def plot(self, path: Path, result: dict[str, Any]) -> None:
+        """Fall rate with its interval against impulse."""
+        import matplotlib
+
+        matplotlib.use("Agg")
+        import matplotlib.pyplot as plt
+
+        figure, axis = plt.subplots(figsize=(5.2, 3.8), constrained_layout=True)
+        draw_fall_curve(axis, result, "#2171b5", result["method"])
+        axis.set(xlabel="impulse [N s]", ylabel="share of worlds that fell", ylim=(-0.02, 1.02))
+        axis.grid(alpha=0.2)
+        axis.legend(frameon=False)
+        save_figure(figure, path)
+
+
+def draw_fall_curve(axis: Any, result: dict[str, Any], color: str, label: str) -> None:
+    """Add one result's curve to a matplotlib axis."""
+    points = [
+        (x, r["mean"], *r["ci95"])
+        for x, r in zip(result["fall_curve"]["impulse"], result["fall_curve"]["fall_rate"], strict=True)
+        if r["mean"] is not None
+    ]
+    x, mean, low, high = zip(*points, strict=True)
+    axis.plot(x, mean, "o-", color=color, ms=3, label=label)
+    axis.fill_between(x, low, high, color=color, alpha=0.2, lw=0)
+
+
+def half_point(
+    impulse: torch.Tensor, level: torch.Tensor, fell: torch.Tensor, seed: int = 0, resamples: int = 500
+) -> dict[str, Any]:
+    """Impulse at which half of the robots fall, with a bootstrap 95 % interval over worlds.
+
+    The fall rate is taken to grow with the impulse (isotonic regression) and to be linear between levels.
+
+    Args:
+        impulse: (L,) ascending [N s].
+        level: (N,) which of them each world took.
+        fell: (N,) bool.
+        seed: Of the bootstrap.
+        resamples: Of the bootstrap.
+    """
+    found = _crossing(impulse, level, fell)
+    if found is None:
+        low = bool(fell[level == 0].float().mean() >= 0.5) if (level == 0).any() else False
+        reason = "half or more fall without a blow" if low else f"fewer than half fall at {float(impulse[-1]):g} N s"
+        return {"mean": None, "ci95": None, "reason": reason}
+    rng = torch.Generator().manual_seed(seed)
+    n = len(level)
+    draws = (torch.randint(0, n, (n,), generator=rng) for _ in range(resamples))
+    crossings = [_crossing(impulse, level[d], fell[d]) for d in draws]
+    known = torch.tensor([c for c in crossings if c is not None], dtype=torch.float64)
+    if len(known) < 0.975 * resamples:
+        return {"mean": found, "ci95": None, "reason": "the interval reaches beyond the impulses that were tried"}
+    low, high = torch.quantile(known, torch.tensor([0.025, 0.975], dtype=torch.float64)).tolist()
+    return {"mean": found, "ci95": [low, high]}
+
+
+def _crossing(impulse: torch.Tensor, level: torch.Tensor, fell: torch.Tensor) -> float | None:
+    count = torch.bincount(level, minlength=len(impulse))
+    seen = count > 0
+    rate = torch.bincount(level, fell.double(), minlength=len(impulse))[seen] / count[seen]
+    x, y = impulse[seen].double(), torch.from_numpy(isotonic_regression(rate.numpy(), weights=count[seen].numpy()).x)
+    above = (y >= 0.5).nonzero().flatten()
+    if len(above) == 0 or int(above[0]) == 0:
+        return None
+    i = int(above[0])
+    return float(x[i - 1] + (0.5 - y[i - 1]) / (y[i] - y[i - 1]) * (x[i] - x[i - 1]))

@@ -1,0 +1,237 @@
+"""Commanded against felt stiffness over many arm poses at once: how faithful compliance is while a policy stands."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from cotap.checks import require_one_of, require_positive_int, require_range
+from cotap.compliance import condition_number
+from cotap.compliance.dynamics import gravity_torque
+from cotap.envs import H1Env, H1EnvConfig
+from cotap.envs.commands import STEADY_RAD
+from cotap.envs.reference import ClipConfig, load_clips
+from cotap.evaluation.metrics import summarize
+from cotap.evaluation.report import save_figure
+from cotap.evaluation.rollout import PolicyFunction
+from cotap.evaluation.scenario import PELVIS
+from cotap.evaluation.static import settle
+from cotap.robots import RobotSpec
+from cotap.robots.chains import arm_chains, arm_inertias
+
+HOLDABLE = 0.9
+"""Loads that ask an arm joint for more than this share of its torque limit are not tried."""
+
+
+@dataclass
+class Fidelity:
+    """Poses of the shipped motion, every axis, several stiffnesses; a load that should move the hand by a set way."""
+
+    poses: int = 16
+    """Number of arm poses, drawn from the shipped motion."""
+    stiffness_levels: tuple[float, ...] = (100.0, 200.0, 400.0, 800.0)
+    """Hand stiffnesses, on all axes [N/m]; they take the place of `--stiffness`."""
+    displacement: float = 0.02
+    """How far the load should move the hand, at most 0.05 [m]."""
+    condition: float = 8.0
+    """Largest condition number of the hand's Jacobian among the poses."""
+    hand: str = "left"
+    """left or right."""
+    pelvis: str = "free"
+    """free: standing, under the policy. fixed: held in the air, no policy."""
+    settle_seconds: float = 6.0
+    """How long the robot is left to settle without the load, then with it; the last second of each is measured [s]."""
+    arm_actions: bool = True
+    """Let the policy's own residual move the arms."""
+    torque_limit_scale: float = 1.0
+    """Factor on the robot's torque limits."""
+    seed: int = 0
+    """Seed of worlds and poses."""
+
+    def check(self) -> None:
+        """Raise ValueError naming the first field that is out of its range."""
+        require_positive_int("poses", self.poses)
+        if not self.stiffness_levels:
+            raise ValueError("stiffness_levels must not be empty")
+        for i, value in enumerate(self.stiffness_levels):
+            require_range(f"stiffness_levels[{i}]", value, 1.0, 1e5)
+        require_range("displacement", self.displacement, 1e-4, 0.05)
+        require_range("condition", self.condition, 1.0, 1e3)
+        require_one_of("hand", self.hand, ("left", "right"))
+        require_one_of("pelvis", self.pelvis, PELVIS)
+        require_range("settle_seconds", self.settle_seconds, 2.0, 600.0)
+        require_range("torque_limit_scale", self.torque_limit_scale, 1e-3, 1e3)
+
+    @property
+    def num_envs(self) -> int:
+        """Worlds in all: poses, axes, stiffnesses."""
+        return self.poses * 3 * len(self.stiffness_levels)
+
+    def configure(self, env: H1EnvConfig) -> H1EnvConfig:
+        """Turn an environment into this protocol's. Changes and returns `env`."""
+        self.check()
+        env.num_envs, env.seed, env.torque_limit_scale = self.num_envs, self.seed, self.torque_limit_scale
+        env.assist.enabled = env.hand_forces.enabled = env.blows.enabled = env.randomization.enabled = False
+        env.observations.noise.enabled = False
+        env.fixed_base = self.pelvis == "fixed"
+        env.motions.clips.share, env.impedance.share = 0.0, 0.0
+        env.terminations.episode_s = 1e6
+        env.commands.steady_rad = STEADY_RAD
+        env.commands.stand_probability, env.commands.height_offset = 1.0, (0.0, 0.0)
+        env.force.force, env.force.hand, env.force.start_s = (1.0, 1.0, 1.0), self.hand, self.settle_seconds
+        return env
+
+
+@dataclass(frozen=True)
+class FidelityResult:
+    """W worlds, each with a pose, an axis and a stiffness of its own."""
+
+    axis: torch.Tensor
+    """(W,) 0, 1 or 2."""
+    stiffness: torch.Tensor
+    """(W,) commanded [N/m]."""
+    way: torch.Tensor
+    """(W,) how far the hand went along the load, as a share of how far it should."""
+    fell: torch.Tensor
+    """(W,) bool."""
+    unholdable: torch.Tensor
+    """(W,) bool: the load asks for more torque than the arm is trusted with; left out."""
+    saturated: torch.Tensor
+    """(W,) bool: an arm joint was at its torque limit at the end."""
+
+    @property
+    def counted(self) -> torch.Tensor:
+        """(W,) bool: worlds that say something about stiffness."""
+        return ~(self.fell | self.unholdable)
+
+
+def conditions(joints: torch.Tensor, spec: RobotSpec) -> torch.Tensor:
+    """Condition number (T, A) of each hand's Jacobian, for arm joints (T, U)."""
+    chains = arm_chains(spec)
+    return condition_number(chains.jacobian(chains.pose(joints.unflatten(1, (len(spec.arms), -1)))))
+
+
+def shipped_poses(spec: RobotSpec) -> torch.Tensor:
+    """Arm joints (T, U) of all the shipped motion, at 50 Hz."""
+    clips = load_clips(ClipConfig(held_out=()), spec).clips
+    return torch.cat([torch.as_tensor(clip.arms) for clip in clips])
+
+
+def measure(env: H1Env, protocol: Fidelity, policy: PolicyFunction | None) -> tuple[FidelityResult, float]:
+    """Run the protocol in `env`, made from its config. Returns what was measured, and the share of the shipped
+    motion's time that poses of its condition number cover."""
+    side = [arm.side for arm in env.spec.arms].index(protocol.hand)
+    frames = shipped_poses(env.spec)
+    good = conditions(frames, env.spec)[:, side] <= protocol.condition
+    if not good.any():
+        raise ValueError(f"condition {protocol.condition}: no pose of the shipped motion has one that low")
+    rng = torch.Generator().manual_seed(protocol.seed)
+    chosen = frames[good][torch.randint(0, int(good.sum()), (protocol.poses,), generator=rng)]
+    levels = torch.tensor(protocol.stiffness_levels)
+    pose, axis, level = (
+        x.flatten()
+        for x in torch.meshgrid(torch.arange(protocol.poses), torch.arange(3), torch.arange(len(levels)), indexing="ij")
+    )
+    stiffness = levels[level]
+    direction = torch.nn.functional.one_hot(axis, 3) * (2.0 * torch.randint(0, 2, (len(axis), 1), generator=rng) - 1.0)
+    force = stiffness.unsqueeze(1) * protocol.displacement * direction
+    env.upper_body.parameters.stiffness[:] = stiffness[:, None, None]
+    env.scripted.amplitude_h.zero_()
+    env.scripted.amplitude_h[:, side] = force
+    env.motions.hold(chosen[pose])
+    unholdable = _torque_share(env, chosen[pose], side, force) > HOLDABLE
+    n = env.num_envs
+    nominal = torch.full((n,), env.spec.nominal_height_m)
+    env.commands.override(torch.zeros(n, 2), torch.zeros(n), torch.ones(n), nominal)
+    settled = settle(
+        env, policy if protocol.pelvis == "free" else None, protocol.settle_seconds, side, protocol.arm_actions
+    )
+    way = (settled.moved * direction).sum(1) / protocol.displacement
+    result = FidelityResult(axis, stiffness, way, settled.fell, unholdable, settled.saturated)
+    return result, float(good.float().mean())
+
+
+def _torque_share(env: H1Env, pose: torch.Tensor, side: int, force: torch.Tensor) -> torch.Tensor:
+    """Largest share (N,) of its limit that a joint of the arm needs at `pose` (N, U) under `force` (N, 3), upright."""
+    chains = arm_chains(env.spec)
+    at = chains.pose(pose.unflatten(1, (len(env.spec.arms), -1)))
+    up = torch.tensor([0.0, 0.0, 1.0]).expand(len(pose), 3)
+    needed = gravity_torque(arm_inertias(env.spec), at, up)[:, side]
+    needed = needed - (chains.jacobian(at)[:, side].transpose(-1, -2) @ force.unsqueeze(-1)).squeeze(-1)
+    return (needed.abs() / env.arm_limits[side]).amax(1)
+
+
+def summary(result: FidelityResult, coverage: float, protocol: Fidelity) -> dict[str, Any]:
+    """The measured part of the evaluation's JSON. Errors are of the felt stiffness, as shares of the commanded one."""
+    rows = []
+    for axis, name in enumerate("xyz"):
+        for level in protocol.stiffness_levels:
+            mine = result.counted & (result.axis == axis) & (result.stiffness == level)
+            rows.append({"axis": name, "stiffness": level, **_error(result.way[mine], protocol.seed)})
+    way = result.way[result.counted]
+    error = (1.0 / way[way > 0.0] - 1.0).abs()
+    worst = [abs(row["error"]) for row in rows if row["error"] is not None]
+    return {
+        "coverage": coverage,
+        "num_unholdable": int(result.unholdable.sum()),
+        "num_saturated": int((result.saturated & result.counted).sum()),
+        "fidelity": rows,
+        "largest_error": max(worst) if worst else None,
+        "metrics": {"stiffness_error": summarize(error, protocol.seed)},
+        "error_quantiles": _quantiles(error),
+    }
+
+
+def _quantiles(error: torch.Tensor) -> dict[str, float] | None:
+    """Median and 95th percentile; None of nothing."""
+    if len(error) == 0:
+        return None
+    return {"50": float(error.quantile(0.5)), "95": float(error.quantile(0.95))}
+
+
+def _error(way: torch.Tensor, seed: int) -> dict[str, Any]:
+    """Error of the stiffness that the mean displacement over poses amounts to, with its interval."""
+    mean = summarize(way, seed)
+    if mean["mean"] is None or mean["ci95"][0] <= 0.0:
+        return {"error": None, "ci95": None, "n": mean["n"], "reason": "the hand did not go where the load is"}
+    low, high = mean["ci95"]
+    return {"error": 1.0 / mean["mean"] - 1.0, "ci95": [1.0 / high - 1.0, 1.0 / low - 1.0], "n": mean["n"]}
+
+
+def table(content: dict[str, Any]) -> str:
+    """Errors by axis and stiffness, as Markdown."""
+    lines = ["| axis | commanded [N/m] | error | 95 % interval | poses |", "|---|---|---|---|---|"]
+    for row in content["fidelity"]:
+        error, interval = "-", row.get("reason", "")
+        if row["error"] is not None:
+            error, interval = f"{row['error']:+.1%}", "{:+.1%} to {:+.1%}".format(*row["ci95"])
+        lines.append(f"| {row['axis']} | {row['stiffness']:g} | {error} | {interval} | {row['n']} |")
+    notes = [
+        f"{content['num_falls']} of {content['num_envs']} worlds fell",
+        f"{content['num_unholdable']} loads beyond the arm's torque",
+        f"poses cover {content['coverage']:.0%} of the shipped motion's time",
+    ]
+    return "\n".join([*lines, "", f"fidelity, {content['method']}: {'; '.join(notes)}"])
+
+
+def plot(path: Path, content: dict[str, Any]) -> None:
+    """Error against commanded stiffness, axis by axis."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axis = plt.subplots(figsize=(5.2, 3.8), constrained_layout=True)
+    for name, color in zip("xyz", ("#cb181d", "#238b45", "#2171b5"), strict=True):
+        rows = [r for r in content["fidelity"] if r["axis"] == name and r["error"] is not None]
+        error = [100.0 * r["error"] for r in rows]
+        spread = [[100.0 * abs(r["error"] - r["ci95"][k]) for r in rows] for k in (0, 1)]
+        axis.errorbar([r["stiffness"] for r in rows], error, spread, fmt="o-", color=color, ms=3, capsize=2, label=name)
+    axis.axhline(0.0, color="0.4", lw=0.8)
+    axis.set(xscale="log", xlabel="commanded stiffness [N/m]", ylabel="error of the felt stiffness [%]")
+    axis.grid(alpha=0.2)
+    axis.legend(frameon=False)
+    save_figure(figure, path)

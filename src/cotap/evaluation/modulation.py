@@ -1,0 +1,90 @@
+"""Stiffness and blend stepped and ramped over their whole range, while the robot walks or bears a load."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from cotap.checks import require_interval, require_one_of, require_range
+from cotap.envs import H1Env
+from cotap.evaluation.disturbance import ConstantLoad, window_measures
+from cotap.evaluation.metrics import summaries
+from cotap.evaluation.rollout import Trajectory
+
+CHANGES = ("step", "ramp", "both")
+
+
+@dataclass
+class Modulation(ConstantLoad):
+    """Both ends of the range of stiffness and alpha, over and over, each world and arm in its own time."""
+
+    change: str = "both"
+    """step: from one end to the other at once. ramp: there and back evenly. both: every other world each."""
+    stiffness_range: tuple[float, float] = (80.0, 1200.0)
+    """Hand stiffness on all axes, ramped evenly in its logarithm [N/m]."""
+    alpha_range: tuple[float, float] = (0.0, 1.0)
+    """Share of compliance."""
+    period: float = 1.0
+    """From one end of the stiffness and back [s]; alpha takes the golden ratio of it, so that all pairs occur."""
+    force: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """A load that is held, along x, y and z of the heading frame [N]; zero for none."""
+    window: tuple[float, float] = (0.0, 9.0)
+    """What is measured, from the onset [s]."""
+    episode_seconds: float = 10.0
+    """Length of the evaluation [s]."""
+
+    def check(self) -> None:
+        """Raise ValueError naming the first field that is out of its range."""
+        super().check()
+        require_one_of("change", self.change, CHANGES)
+        require_interval("stiffness_range", self.stiffness_range)
+        require_range("stiffness_range[0]", self.stiffness_range[0], 1.0, 1e5)
+        require_range("stiffness_range[1]", self.stiffness_range[1], 1.0, 1e5)
+        require_interval("alpha_range", self.alpha_range)
+        for i, value in enumerate(self.alpha_range):
+            require_range(f"alpha_range[{i}]", value, 0.0, 1.0)
+        require_range("period", self.period, 0.04, 3600.0)
+
+    def prepare(self, env: H1Env) -> None:
+        """Draw where in the cycle every world and arm begins."""
+        super().prepare(env)
+        if not env.upper_body.active:
+            raise ValueError("modulation needs a law with a stiffness, such as --method cotap; got pd on both arms")
+        rng = torch.Generator().manual_seed(self.seed)
+        self.phase = torch.rand(env.num_envs, len(env.spec.arms), 2, generator=rng)
+
+    def before_step(self, env: H1Env, step: int) -> None:
+        """Set stiffness and alpha of this step."""
+        cycles = step * env.dt / self.period * torch.tensor([1.0, 2.0 / (1.0 + math.sqrt(5.0))]) + self.phase
+        stepped = {"step": True, "ramp": False}.get(self.change)
+        mask = torch.arange(env.num_envs) % 2 == 0 if stepped is None else torch.full((env.num_envs,), stepped)
+        stiffness, alpha = sweep(cycles, mask[:, None, None]).unbind(2)
+        low, high = (math.log(bound) for bound in self.stiffness_range)
+        p = env.upper_body.parameters
+        p.stiffness[:] = (low + (high - low) * stiffness).exp().unsqueeze(2)
+        p.alpha[:] = self.alpha_range[0] + (self.alpha_range[1] - self.alpha_range[0]) * alpha
+
+    def measure(self, trajectory: Trajectory, env: H1Env) -> dict[str, Any]:
+        """The measured part of the evaluation's JSON; with both kinds of change, also of each by itself."""
+        result = super().measure(trajectory, env) | {
+            "effective_stiffness": {"commanded": None, "measured": None, "reason": "stiffness changes all the time"}
+        }
+        if self.change == "both":
+            steps = torch.arange(env.num_envs) % 2 == 0
+            onset = round(self.onset / trajectory.dt)
+            begin, end = (onset + round(bound / trajectory.dt) for bound in self.window)
+            measures = window_measures(trajectory, begin, end, self.hit(env))
+            result["by_change"] = {
+                name: summaries(measures, mask, self.seed) for name, mask in (("step", steps), ("ramp", ~steps))
+            }
+        return result
+
+
+def sweep(cycles: torch.Tensor, stepped: torch.Tensor) -> torch.Tensor:
+    """Between 0 and 1 and back once a cycle: at once where `stepped`, else evenly."""
+    phase = cycles.remainder(1.0)
+    triangle = 1.0 - (2.0 * phase - 1.0).abs()
+    return torch.where(stepped, (phase >= 0.5).float(), triangle)

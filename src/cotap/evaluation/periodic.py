@@ -1,0 +1,150 @@
+"""Hands under a slowly swinging load, each arm under a law of its own, beside what statics asks for (paper, Fig. 7)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from cotap.checks import require_finite, require_range
+from cotap.envs import H1Env, H1EnvConfig
+from cotap.envs.forces import ForceProfile
+from cotap.evaluation.disturbance import falls_by_time, window_measures
+from cotap.evaluation.metrics import summaries
+from cotap.evaluation.report import save_figure
+from cotap.evaluation.rollout import Trajectory
+from cotap.evaluation.scenario import Scenario
+from cotap.robots import RobotSpec
+
+
+@dataclass
+class PeriodicLoad(Scenario):
+    """A sinusoidal load on both hands: 30 N up and down in 4 s."""
+
+    force: tuple[float, float, float] = (0.0, 0.0, 30.0)
+    """Amplitude along x, y and z of the heading frame [N]."""
+    hand: str = "both"
+    """left, right or both."""
+    period: float = 4.0
+    """[s]."""
+    periods: int = 3
+    """How many; all but the first are measured."""
+    onset: float = 1.0
+    """When it sets in [s]."""
+
+    def check(self) -> None:
+        """Raise ValueError naming the first field that is out of its range."""
+        super().check()
+        for i, value in enumerate(self.force):
+            require_finite(f"force[{i}]", value)
+        require_range("period", self.period, 0.2, 600.0)
+        require_range("periods", self.periods, 2, 1000)
+        require_range("onset", self.onset, 0.02, 3600.0)
+
+    @property
+    def seconds(self) -> float:
+        """Length of the evaluation [s]."""
+        return self.onset + self.periods * self.period
+
+    def configure(self, env: H1EnvConfig) -> H1EnvConfig:
+        """Turn the environment that a policy was trained in into this protocol's. Changes and returns `env`."""
+        env.force = ForceProfile(self.force, self.hand, self.onset, self.seconds, self.period)
+        return super().configure(env)
+
+    def measure(self, trajectory: Trajectory, env: H1Env) -> dict[str, Any]:
+        """The measured part of the evaluation's JSON."""
+        t = trajectory
+        begin, end = (round(s / t.dt) for s in (self.onset + self.period, self.seconds))
+        elbows, sides = elbow_joints(env.spec), [arm.side for arm in env.spec.arms]
+        hit = [i for i, side in enumerate(sides) if self.hand in (side, "both")]
+        measures = window_measures(t, begin, end, hit) | swing_measures(t, begin, end, self.period, elbows, sides)
+        stood = ~t.fell.any(0)
+        return {
+            "falls": falls_by_time(t, round(self.onset / t.dt), end),
+            "metrics": summaries(measures, torch.ones_like(stood), self.seed),
+            "metrics_without_falls": summaries(measures, stood, self.seed),
+            "window": {"start": self.onset + self.period, "end": self.seconds},
+            "curve": swing_curve(t, round(self.onset / t.dt), elbows, sides),
+        }
+
+    def plot(self, path: Path, result: dict[str, Any]) -> None:
+        """Elbow torques with the static prediction, and the hands' height, over time."""
+        import matplotlib
+
+        matplotlib.use("Agg")
+        import matplotlib.pyplot as plt
+
+        curves, law = result["curve"], result["settings"]["env"]["upper_body"]
+        figure, (torque, height) = plt.subplots(1, 2, figsize=(10.5, 3.6), constrained_layout=True)
+        for side, color, width in (("left", "#6baed6", 3.5), ("right", "#cb181d", 1.2)):
+            if not curves["time"]:
+                break
+            label = f"{side}: {law[side]['name']}"
+            torque.plot(curves["time"], curves[f"elbow_{side}"], color=color, lw=width, label=label)
+            torque.plot(curves["time"], curves[f"elbow_static_{side}"], color="0.2", ls=":", lw=0.5 * width,
+                        label=f"{side}: statics")  # fmt: skip
+            height.plot(curves["time"], curves[f"hand_z_{side}"], color=color, lw=width, label=label)
+        torque.set(xlabel="time since the load set in [s]", ylabel="elbow torque [Nm]")
+        height.set(xlabel="time since the load set in [s]", ylabel="hand height less reference [m]")
+        for axis in (torque, height):
+            axis.grid(alpha=0.2)
+            axis.legend(frameon=False, fontsize=8, ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+        save_figure(figure, path)
+
+
+def elbow_joints(spec: RobotSpec) -> list[int]:
+    """Each arm's elbow among the arm joints (U)."""
+    joints = [spec.body(arm.elbow_body).joint or "" for arm in spec.arms]
+    return [spec.upper_joints.index(joint) for joint in joints]
+
+
+def swing_measures(
+    t: Trajectory, begin: int, end: int, period_s: float, elbows: list[int], sides: list[str]
+) -> dict[str, torch.Tensor]:
+    """How far elbow torques and hands swing from step `begin` to before `end`, whole periods; per world, (N,) each.
+
+    Amplitudes are those of the load's frequency (least squares); `rms` and `peak` are of everything. `_static_` is the
+    same of `arm_static_torque`: gravity and the load, whatever the law. NaN for worlds that fall before the end.
+    """
+    upright = t.alive()[end - 1]
+    arms = t.arm_torque.shape[2] // len(sides)
+    out: dict[str, torch.Tensor] = {}
+    for i, (side, elbow) in enumerate(zip(sides, elbows, strict=True)):
+        for kind, torque in (("", t.arm_torque), ("static_", t.arm_static_torque)):
+            part = torque[begin:end]
+            arm = part[..., i * arms : (i + 1) * arms]
+            out[f"elbow_amplitude_{kind}{side}"] = amplitude(part[..., elbow], period_s, t.dt)
+            out[f"elbow_rms_{kind}{side}"] = part[..., elbow].square().mean(0).sqrt()
+            out[f"elbow_peak_{kind}{side}"] = part[..., elbow].abs().amax(0)
+            out[f"arm_rms_{kind}{side}"] = arm.square().sum(2).mean(0).sqrt()
+        power = (t.arm_torque * t.arm_velocity)[begin:end, :, i * arms : (i + 1) * arms].abs().sum((0, 2))
+        out[f"energy_{side}"] = power * t.dt
+        out[f"hand_swing_{side}"] = amplitude(t.hand_offset[begin:end, :, i, 2], period_s, t.dt)
+    for name in ("elbow_amplitude", "elbow_rms", "arm_rms"):
+        for kind in ("", "static_"):
+            left, right = (out[f"{name}_{kind}{side}"] for side in sides)
+            out[f"{name}_{kind}ratio"] = left / right
+    return {name: torch.where(upright, value, torch.full_like(value, math.nan)) for name, value in out.items()}
+
+
+def amplitude(values: torch.Tensor, period_s: float, dt: float) -> torch.Tensor:
+    """Amplitude (N,) of the part of `values` (T, N) that swings with this period, by least squares."""
+    angle = 2.0 * math.pi * dt / period_s * torch.arange(values.shape[0])
+    basis = torch.stack((torch.ones_like(angle), angle.sin(), angle.cos()), 1)
+    return torch.linalg.lstsq(basis, values).solution[1:].norm(dim=0)
+
+
+def swing_curve(t: Trajectory, onset: int, elbows: list[int], sides: list[str]) -> dict[str, list[float]]:
+    """Means over the worlds that stood, over time from the onset."""
+    stood = ~t.fell.any(0)
+    if not stood.any():
+        return {"time": []}
+    rows = {"time": (torch.arange(onset, len(t.fell)) - onset + 1) * t.dt}
+    for i, (side, elbow) in enumerate(zip(sides, elbows, strict=True)):
+        rows[f"elbow_{side}"] = t.arm_torque[onset:, stood, elbow].mean(1)
+        rows[f"elbow_static_{side}"] = t.arm_static_torque[onset:, stood, elbow].mean(1)
+        rows[f"hand_z_{side}"] = t.hand_offset[onset:, stood, i, 2].mean(1)
+    return {name: values.tolist() for name, values in rows.items()}

@@ -1,0 +1,89 @@
+"""Observations and laws as the ablations have them."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from cotap.compliance import modulate_stiffness, resolve_joint_stiffness
+from cotap.compliance.laws import LawConfig
+from cotap.configs import BASE_RECIPES, DISTILL_RECIPES, BaseTraining
+from cotap.envs.observations import ObservationConfig
+from cotap.envs.upper_body import LawSampling, UpperBodyConfig
+
+TORQUE = 8
+
+
+def test_arm_torque_moves_from_the_actor_to_the_critic(make_env):
+    usual, moved = make_env(3), make_env(3, observations=ObservationConfig(arm_torque="critic"))
+    one, two = usual.get_observations(), moved.get_observations()
+    assert one["policy"].shape[1] - two["policy"].shape[1] == 5 * TORQUE
+    torch.testing.assert_close(two["policy"], one["policy"][:, : -5 * TORQUE])
+    # The critic's: orientation, velocity, torque, forces.
+    torque = one["policy"][:, -TORQUE:]
+    torch.testing.assert_close(two["privileged"][:, 7 : 7 + TORQUE], torque)
+    torch.testing.assert_close(two["privileged"][:, 7 + TORQUE :], one["privileged"][:, 7:])
+    assert usual.layout()["terms"] != moved.layout()["terms"]
+    assert ["arm_torque", 8, 1.0] in moved.layout()["critic_terms"]
+
+
+def test_goals_are_what_the_laws_are_asked_for(make_env):
+    left, right = LawConfig("cotap", (300.0 * math.e, 300.0, 300.0 / math.e), 40.0 * math.e, 0.25), LawConfig("pd")
+    env = make_env(2, observations=ObservationConfig(goals=True), upper_body=UpperBodyConfig(left, right))
+    goals = env.get_observations()["policy"][0, -10:]
+    assert goals.tolist() == pytest.approx([1.0, 0.0, -1.0, 1.0, 0.25, 0.0, 0.0, 0.0, 0.0, 1.0], abs=1e-5)
+    mirrored = env.symmetry.observations["policy"](env.get_observations()["policy"])[0, -10:]
+    assert mirrored.tolist() == pytest.approx([*goals[5:].tolist(), *goals[:5].tolist()])
+
+
+def test_mirror_images_of_the_critics_observation_are_their_own(make_env):
+    env = make_env(4, observations=ObservationConfig(arm_torque="critic", goals=True))
+    obs = env.get_observations()
+    for group, value in obs.items():
+        reflect = env.symmetry.observations[group]
+        torch.testing.assert_close(reflect(reflect(value)), value)
+        assert reflect.index.numel() == value.shape[1]
+
+
+def test_goals_vary_in_the_base_that_learns_to_see_them(make_env):
+    env = make_env(
+        16, observations=ObservationConfig(goals=True), upper_body=UpperBodyConfig(sampling=LawSampling(True))
+    )
+    assert float(env.get_observations()["policy"][:, -10:].std(0).min()) > 0.05
+
+
+def test_without_the_ratio_stiffness_is_what_alpha_alone_makes_of_it(make_env):
+    """At an elbow angle with a condition number beyond 10, against the general form with the plain alpha."""
+    law = LawConfig("cotap", (300.0, 200.0, 400.0), 30.0, 0.6)
+    env = make_env(2, upper_body=UpperBodyConfig(law, law, singularity_ratio=False))
+    with_ratio = make_env(2, upper_body=UpperBodyConfig(law, law))
+    for e in (env, with_ratio):
+        e.sim.qpos[:, 7 + 14] = e.sim.qpos[:, 7 + 18] = 1.45
+        e.state = e.reader.read()
+        e.upper_body.send(e.state, e.targets.current[:, 11:])
+    s = env.state
+    jacobian = (s.heading_w.transpose(1, 2) @ s.torso_rotation_w).unsqueeze(1) @ env.reader.arm_chains.jacobian(s.arms)
+    jacobian = jacobian.double()
+    k = resolve_joint_stiffness(jacobian, torch.tensor(law.stiffness).double().expand(2, 2, 3), 30.0)
+    pd = 100.0 * torch.eye(4, dtype=torch.float64).expand_as(k)
+    expected = modulate_stiffness(k, pd, torch.tensor(0.6, dtype=torch.float64).expand(2, 2)).float()
+    torch.testing.assert_close(env.upper_body._stiffness[1], expected, rtol=2e-3, atol=0.05)
+    assert (with_ratio.upper_body._stiffness[1] - expected).abs().max() > 1.0
+
+
+@pytest.mark.parametrize("recipe", ["torque-critic", "goals"])
+def test_recipes_of_other_observations_want_a_base_of_their_own(recipe):
+    with pytest.raises(ValueError, match=f"base --recipe {recipe}"):
+        DISTILL_RECIPES[recipe](BaseTraining())
+    training = DISTILL_RECIPES[recipe](BASE_RECIPES[recipe]())
+    training.check()
+    assert training.env.observations == BASE_RECIPES[recipe]().env.observations
+
+
+def test_the_ratio_is_switched_off_by_its_recipe_alone():
+    base = BASE_RECIPES["default"]()
+    off = {name: not make(base).env.upper_body.singularity_ratio for name, make in DISTILL_RECIPES.items()
+           if name in ("default", "paper", "no-ratio")}  # fmt: skip
+    assert off == {"default": False, "paper": False, "no-ratio": True}

@@ -1,0 +1,83 @@
+"""Fidelity over poses: sums by hand, and arms alone against what statics says."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from cotap.envs import H1Env, H1EnvConfig
+from cotap.evaluate import main
+from cotap.evaluation.fidelity import Fidelity, FidelityResult, conditions, measure, shipped_poses, summary, table
+from cotap.evaluation.law_options import LawOptions
+
+
+def result(**changes: torch.Tensor) -> FidelityResult:
+    fields = {
+        "axis": torch.tensor([0, 0, 1, 1, 2, 2]),
+        "stiffness": torch.full((6,), 200.0),
+        "way": torch.tensor([1.0, 1.0, 0.5, 0.5, 1.0, 9.0]),
+        "fell": torch.tensor([False] * 5 + [True]),
+        "unholdable": torch.tensor([False] * 6),
+        "saturated": torch.tensor([True] + [False] * 5),
+    }
+    return FidelityResult(**(fields | changes))
+
+
+def test_errors_by_hand():
+    """Twice too stiff along y; who falls or could not hold the load does not count."""
+    out = summary(result(), 0.8, Fidelity(stiffness_levels=(200.0,)))
+    assert [row["error"] for row in out["fidelity"]] == pytest.approx([0.0, 1.0, 0.0])
+    assert [row["n"] for row in out["fidelity"]] == [2, 2, 1]
+    assert out["largest_error"] == pytest.approx(1.0)
+    assert out["metrics"]["stiffness_error"]["mean"] == pytest.approx(2.0 / 5.0)
+    assert out["num_saturated"] == 1
+    out = summary(result(unholdable=torch.tensor([False, False, True, True, False, False])), 0.8,
+                  Fidelity(stiffness_levels=(200.0,)))  # fmt: skip
+    assert out["fidelity"][1]["error"] is None
+    assert out["fidelity"][1]["reason"]
+    assert out["num_unholdable"] == 2
+    content = out | {"num_falls": 1, "num_envs": 6, "method": "cotap"}
+    assert "| y | 200 | - |" in table(content)
+
+
+def test_condition_numbers_are_those_of_mujocos_jacobian(model, spec):
+    import mujoco
+    import numpy as np
+
+    poses = shipped_poses(spec)[::2000]
+    found = conditions(poses, spec)
+    data = mujoco.MjData(model)
+    for i, pose in enumerate(poses.numpy()):
+        data.qpos[3] = 1.0
+        for name, angle in zip(spec.upper_joints, pose, strict=True):
+            data.joint(name).qpos[0] = angle
+        mujoco.mj_forward(model, data)
+        for a, arm in enumerate(spec.arms):
+            jac = np.zeros((3, model.nv))
+            site = data.site(f"{arm.side}_hand").xpos
+            mujoco.mj_jac(model, data, jac, None, site, model.body(arm.hand_body).id)
+            expected = np.linalg.cond(jac[:, [model.joint(j).dofadr[0] for j in arm.joints]])
+            assert float(found[i, a]) == pytest.approx(expected, rel=1e-2)
+
+
+@pytest.mark.parametrize(("error", "allowed"), [("joint", 0.12), ("task", 0.02)])
+def test_arms_alone_are_as_stiff_as_they_are_asked_to_be(error, allowed):
+    protocol = Fidelity(poses=2, stiffness_levels=(300.0,), displacement=0.01, pelvis="fixed")
+    cfg = protocol.configure(H1EnvConfig(num_threads=1))
+    cfg.upper_body = LawOptions(method="cotap", error=error).configure()
+    found, coverage = measure(H1Env(cfg), protocol, None)
+    assert 0.3 < coverage <= 1.0
+    assert found.counted.sum() >= 4
+    out = summary(found, coverage, protocol)
+    assert out["largest_error"] < allowed
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [(["--displacement", "0.2"], "displacement"), (["--poses", "0"], "poses"), (["--method", "pd"], "fidelity needs"),
+     (["--stiffness-levels", "0"], "stiffness_levels[0]"), (["--hand", "both"], "hand 'both' is unknown"),
+     (["--condition", "1.0"], "no pose")],
+)  # fmt: skip
+def test_bad_options_are_named(options, message, capsys):
+    assert main(["fidelity", *(["--poses", "1"] if "--poses" not in options else []), *options]) == 2
+    assert message in capsys.readouterr().err

@@ -1,0 +1,90 @@
+"""Differences of two evaluations."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+
+from cotap.compare import compare, difference, main
+from cotap.evaluation.metrics import summarize
+
+
+def result(**metrics):
+    return {
+        "protocol": "impact",
+        "method": "pd",
+        "settings": {"seed": 0, "env": {"substeps": 2}},
+        "metrics": metrics,
+        "metrics_without_falls": {},
+        "window": {"start": 1.0, "end": 2.0},
+    }
+
+
+def test_difference_by_hand():
+    a = {"mean": 1.0, "ci95": [0.7, 1.4]}
+    b = {"mean": 2.0, "ci95": [1.6, 2.3]}
+    d = difference(a, b)
+    assert d["difference"] == 1.0
+    assert d["ci95"] == pytest.approx([1.0 - (0.4**2 + 0.4**2) ** 0.5, 1.0 + (0.3**2 + 0.3**2) ** 0.5])
+
+
+def test_shares_get_newcombes_interval():
+    """56 of 70 against 48 of 80: Newcombe (1998) gives 0.0524 to 0.3339 for the difference 0.2."""
+    more, less = (summarize(torch.arange(n) < k) for k, n in ((56, 70), (48, 80)))
+    d = difference(less, more)
+    assert d["difference"] == pytest.approx(0.2)
+    assert d["ci95"] == pytest.approx([0.0524, 0.3339], abs=5e-4)
+
+
+def test_intervals_cover_a_true_difference_at_their_rate():
+    rng, hits = torch.Generator().manual_seed(0), 0
+    for seed in range(200):
+        a = summarize(torch.randn(50, generator=rng), seed, 200)
+        b = summarize(0.3 + 2.0 * torch.randn(80, generator=rng), seed, 200)
+        low, high = difference(a, b)["ci95"]
+        hits += low <= 0.3 <= high
+    assert 180 <= hits <= 199
+
+
+def test_what_one_could_not_measure_is_null_with_the_reason():
+    none = {"mean": None, "ci95": None, "reason": "no world"}
+    d = difference(none, {"mean": 1.0, "ci95": [0.5, 1.5]})
+    assert d["difference"] is None
+    assert d["reason"] == "A: no world"
+
+
+def test_settings_that_differ_are_listed():
+    a, b = result(x={"mean": 1.0, "ci95": [0.9, 1.1]}), result(x={"mean": 1.5, "ci95": [1.4, 1.6]}, y={})
+    b["settings"]["env"]["substeps"] = 4
+    b["method"] = "cotap"
+    out = compare(a, b)
+    assert list(out["differences"]) == ["x"]
+    assert out["settings"] == {"env.substeps": [2, 4], "method": ["pd", "cotap"]}
+
+
+def test_the_command(tmp_path, capsys):
+    a, b = tmp_path / "a.json", tmp_path / "b.json"
+    a.write_text(json.dumps(result(x={"mean": 1.0, "ci95": [0.9, 1.1]})))
+    b.write_text(json.dumps(result(x={"mean": 1.5, "ci95": [1.4, 1.6]})))
+    assert main([str(a), str(b), "--json", str(tmp_path / "out.json")]) == 0
+    assert "| x | 1.0000 | 1.5000 | +0.5000 |" in capsys.readouterr().out
+    assert json.loads((tmp_path / "out.json").read_text())["differences"]["x"]["difference"] == 0.5
+
+
+@pytest.mark.parametrize("text", ["not json", "[]", '{"protocol": "impact"}'])
+def test_files_that_are_no_evaluations_are_named(text, tmp_path, capsys):
+    path = tmp_path / "a.json"
+    path.write_text(text)
+    assert main([str(path), str(path)]) == 2
+    assert "a.json" in capsys.readouterr().err
+
+
+def test_other_protocols_are_not_compared(tmp_path, capsys):
+    a, b = tmp_path / "a.json", tmp_path / "b.json"
+    a.write_text(json.dumps(result()))
+    b.write_text(json.dumps(result() | {"protocol": "punches"}))
+    assert main([str(a), str(b)]) == 2
+    assert "protocols differ: 'impact' and 'punches'" in capsys.readouterr().err
+    assert main([str(a), str(tmp_path / "none.json")]) == 2

@@ -1,0 +1,79 @@
+"""The page that scripts/reproduce_paper.py writes: verdicts, missing checkpoints, numbers as they were measured."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
+import reproduce_paper as rp
+
+
+@pytest.fixture
+def book(tmp_path: Path) -> rp.Book:
+    return rp.Book(tmp_path, tmp_path, 4, 1, False)
+
+
+def measured(mean: float, half: float) -> dict:
+    return {"metrics_without_falls": {"j_upper": {"mean": mean, "std": 1.0, "ci95": [mean - half, mean + half]}}}
+
+
+@pytest.mark.parametrize(
+    ("larger", "verdict"),
+    [(20.0, "holds"), (5.0, "does not hold"), (10.2, "cannot be told apart"), (None, "not measured")],
+)
+def test_an_ordering_gets_the_verdict_that_its_interval_allows(book, larger, verdict):
+    book.results["small"] = measured(10.0, 0.5)
+    if larger is not None:
+        book.results["large"] = measured(larger, 0.5)
+    rp.ordering(book, "claim", "small", "large", "j_upper")
+    assert verdict in book.lines[-1]
+
+
+def test_numbers_are_shown_with_interval_or_reason():
+    assert rp.number({"mean": 0.12345, "ci95": [0.1, 0.2]}) == "0.123 (0.100 to 0.200)"
+    assert rp.number({"mean": None, "ci95": None, "reason": "no world stood"}) == "no world stood"
+    assert rp.number({"mean": 31.0, "ci95": None, "reason": "wide"}, 0) == "31 (wide)"
+
+
+def test_what_is_not_shipped_is_a_row_that_says_so(book, monkeypatch):
+    monkeypatch.setattr("cotap.evaluation.policy.shipped_names", list)
+    monkeypatch.setattr("cotap.evaluate.evaluate", lambda *_: pytest.fail("nothing may be measured"))
+    rp.impacts(book, "stance", "cotap", 1.0, "mixture")
+    rows = [line for line in book.lines if line.startswith("| K 100")]
+    assert "not shipped" in rows[0]
+    assert "0.861 / 0.101 / 46.664" in rows[0]  # the paper's own stay
+    assert not book.results
+    rp.ablations(book, "mixture")
+    rp.periodic(book)
+    rp.torque_observation(book)
+    rp.fidelity(book, True)
+    rp.robustness(book, True)
+    assert sum("not shipped" in line for line in book.lines) >= 20
+
+
+def test_the_papers_tables_have_seven_rows_each():
+    assert all(len(rows) == len(rp.ROWS) == 7 for rows in rp.IMPACT.values())
+    assert set(rp.ROWS) <= set(rp.ARMS)
+
+
+def test_page_and_json_are_written(book, tmp_path):
+    book.add("# Title")
+    book.results["x"] = measured(1.0, 0.1) | {"curve": [1] * 1000}
+    rp.write(tmp_path, book)
+    assert (tmp_path / "results.md").read_text() == "# Title\n"
+    assert json.loads((tmp_path / "results.json").read_text())["x"].keys() == {"metrics_without_falls"}
+
+
+@pytest.mark.slow
+def test_a_part_end_to_end(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    arguments = ["reproduce_paper.py", "--quick", "--num-envs", "8", "--threads", "1", "--only", "load", "periodic"]
+    monkeypatch.setattr(sys, "argv", arguments)
+    assert rp.main() == 0
+    page = (tmp_path / "runs/paper-quick/results.md").read_text()
+    assert "| K_z 500 |" in page
+    assert (tmp_path / "runs/paper-quick/results/periodic_load_base.png").stat().st_size > 5000
