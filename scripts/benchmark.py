@@ -39,14 +39,15 @@ from cotap.agents.dual_ppo import DualPPO
 from cotap.agents.runner import layout_of
 from cotap.checks import require_positive_int, require_range
 from cotap.compliance import ArmKinematics
-from cotap.compliance.laws import Arms, ArmState, CoTaPLaw, LawConfig, LawParameters
+from cotap.compliance.interface import ArmState, LawParameters
+from cotap.compliance.laws import CoTaPLaw, LawConfig
 from cotap.configs import BASE_RECIPES, BaseTraining
 from cotap.envs import H1Env, H1EnvConfig
 from cotap.envs.reference import ReferenceConfig, ReferenceMotion
 from cotap.evaluation.policy import load_policy, shipped_checkpoint
 from cotap.motions import MotionClip, MotionLibrary
 from cotap.robots import RobotSpec, h1
-from cotap.robots.chains import arm_chains, arm_gains, arm_inertias
+from cotap.robots.chains import arm_model
 from cotap.robots.mjcf import build_model
 
 PEER_ENVS = 32
@@ -164,8 +165,9 @@ class Compliance:
 
     def __init__(self, num_envs: int, seconds: float) -> None:
         self.seconds, self.num_envs, spec = seconds, num_envs, h1()
-        self.chains = arm_chains(spec)
-        self.law = CoTaPLaw(Arms(self.chains, arm_inertias(spec), *arm_gains(spec)), LawConfig("cotap"))
+        self.arms = arm_model(spec)
+        self.chains = self.arms.chains
+        self.law = CoTaPLaw(self.arms, LawConfig("cotap"))
         joints = [spec.joints[i] for i in spec.indices(spec.upper_joints)]
         low, high = torch.tensor([j.range_rad for j in joints]).unbind(1)
         rng = torch.Generator().manual_seed(0)

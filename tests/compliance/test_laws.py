@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from cotap.compliance.dynamics import gravity_torque
-from cotap.compliance.laws import Arms, ArmState, CoTaPLaw, LawConfig, LawParameters, PDLaw
+from cotap.compliance.interface import Arms, ArmState, LawParameters
+from cotap.compliance.laws import CoTaPLaw, LawConfig, PDLaw
 from cotap.compliance.stiffness import resolve_joint_stiffness
-from cotap.robots.chains import arm_chains, arm_gains, arm_inertias
+from cotap.robots.chains import arm_model
 
 
 @pytest.fixture
 def arms(spec) -> Arms:
-    return Arms(arm_chains(spec), arm_inertias(spec), *arm_gains(spec))
+    return arm_model(spec)
 
 
 def a_state(arms: Arms, rng, n=6, moved=0.1, base=None) -> ArmState:
@@ -107,7 +110,7 @@ def test_gains_that_differ_are_refused(arms):
     kp = arms.kp.clone()
     kp[0, 0] = 50.0
     with pytest.raises(ValueError, match="cotap needs one position gain on all joints of an arm"):
-        CoTaPLaw(Arms(arms.chains, arms.inertias, kp, arms.kd), LawConfig())
+        CoTaPLaw(replace(arms, kp=kp), LawConfig())
 
 
 @pytest.mark.parametrize(

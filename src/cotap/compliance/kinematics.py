@@ -48,6 +48,11 @@ class SerialChains:
         skew = torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), -1).unflatten(-1, (3, 3))
         self._sine, self._versine = self._fixed @ skew, self._fixed @ skew @ skew
 
+    @property
+    def rodrigues(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Matrices F, S and V, (A, n, 3, 3), of the links' rotations in their parents, `F + sin(q) S + (1 - cos(q)) V`."""
+        return self._fixed, self._sine, self._versine
+
     def pose(self, q: torch.Tensor) -> ChainPose:
         """Pose of every link for joint angles `q` (W, A, n) [rad]."""
         sine, versine = q.sin()[..., None, None], (1.0 - q.cos())[..., None, None]
