@@ -50,7 +50,7 @@ class SerialChains:
 
     @property
     def rodrigues(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Matrices F, S and V, (A, n, 3, 3), of the links' rotations in their parents, `F + sin(q) S + (1 - cos(q)) V`."""
+        """Matrices F, S and V, (A, n, 3, 3), of rotations into the links' parents, `F + sin(q) S + (1 - cos(q)) V`."""
         return self._fixed, self._sine, self._versine
 
     def pose(self, q: torch.Tensor) -> ChainPose:
