@@ -33,7 +33,7 @@ class BaseOptions:
     resume: str = ""
     """Checkpoint to go on from; its config is the default for every option."""
     recipe: str = "default"
-    """default, or paper (the paper's networks)."""
+    """default, paper (the paper's networks), or facet (FACET's tracking reward)."""
     command: tyro.conf.Suppress[str] = ""
     training: Annotated[BaseTraining, tyro.conf.arg(name="")] = field(default_factory=BASE_RECIPES["default"])
 
@@ -52,7 +52,7 @@ class DistillOptions:
     base_checkpoint: str = ""
     """Base policy to begin from and to be guided by; by default the shipped one."""
     recipe: str = "default"
-    """default (80 to 1200 N/m), or paper (150 to 450 N/m)."""
+    """default (80 to 1200 N/m), paper (150 to 450 N/m), or facet (arms under FACET, its tracking reward)."""
     command: tyro.conf.Suppress[str] = ""
     training: Annotated[DistillTraining, tyro.conf.arg(name="")] = field(default_factory=DistillTraining)
 

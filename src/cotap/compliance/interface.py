@@ -44,6 +44,13 @@ class Arms:
     speed: torch.Tensor
     """(A, n) joint velocity limits [rad/s]."""
 
+    def to(self, dtype: torch.dtype) -> Arms:
+        """The same arms in another precision."""
+        i = self.inertias
+        links = LinkInertias(i.mass.to(dtype), i.com.to(dtype), i.inertia.to(dtype), i.armature)
+        limits = (x.to(dtype) for x in (self.kp, self.kd, self.low, self.high, self.speed))
+        return Arms(self.chains.to(dtype), links, *limits)
+
 
 @dataclass(frozen=True)
 class ArmState:
