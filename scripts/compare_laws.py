@@ -179,9 +179,10 @@ class Properties:
     def table(self, result: dict[str, Any]) -> str:
         """As Markdown."""
         lines = [
-            f"| law | adjustable: displacement at {self.stiffness / 2:g} over that at {self.stiffness * 2:g} N/m (ideal 4)"
-            " | wrong model: displacement over that of the right one | and shift without a load [m]"
-            " | largest real part, free [1/s] | poses unstable, worst wall | trials drawn from | while stiffness changes |",
+            f"| law | adjustable: displacement at {self.stiffness / 2:g} over {self.stiffness * 2:g} N/m (ideal 4) "
+            "| wrong model: displacement over the right one's | shift without a load [m] "
+            "| largest real part, free [1/s] | poses unstable, worst wall | trials drawn from "
+            "| the same, stiffness changing |",
             "|---|---|---|---|---|---|---|---|",
         ]
         for name, row in result["rows"].items():

@@ -14,12 +14,12 @@ def observe_torque(
 ) -> torch.Tensor:  # fmt: skip
     """Torque (..., n) that something outside puts on the joints, `p' - tau + tau_gravity`, through a low pass [Nm].
 
-    Centrifugal torques, friction and the acceleration of the arm's base are disregarded, and end up in it.
+    Centrifugal torques and the acceleration of the arm's base are disregarded, and end up in it.
 
     Args:
         residual: (..., n) the estimate of a step ago [Nm].
         momentum_change: (..., n) of `M(q) dq` over the step [Nms/rad].
-        effort: (..., n) mean torque of the motors over the step [Nm].
+        effort: (..., n) mean torque of the motors over the step, less friction [Nm].
         gravity: (..., n) torque that holds the arm against gravity [Nm].
         share: Of the new in the estimate, `1 - exp(-dt / time constant)`.
         dt: [s].

@@ -43,13 +43,15 @@ class Arms:
     """(A, n) upper joint limits [rad]."""
     speed: torch.Tensor
     """(A, n) joint velocity limits [rad/s]."""
+    friction: float = 0.0
+    """Viscous friction of every joint, beside what a law adds [Nms/rad]."""
 
     def to(self, dtype: torch.dtype) -> Arms:
         """The same arms in another precision."""
         i = self.inertias
         links = LinkInertias(i.mass.to(dtype), i.com.to(dtype), i.inertia.to(dtype), i.armature)
         limits = (x.to(dtype) for x in (self.kp, self.kd, self.low, self.high, self.speed))
-        return Arms(self.chains.to(dtype), links, *limits)
+        return Arms(self.chains.to(dtype), links, *limits, self.friction)
 
 
 @dataclass(frozen=True)

@@ -60,6 +60,7 @@ class HandSensors(Stateful):
         momentum = (joint_inertia(self._arms.inertias, pose) @ dq.unsqueeze(-1)).squeeze(-1)
         gravity = gravity_torque(self._arms.inertias, pose, to_heading[:, 2])
         share = 1.0 - math.exp(-self._dt / TIME_CONSTANT_S)
+        effort = effort - self._arms.friction * dq
         self._torque = observe_torque(self._torque, momentum - self._momentum, effort, gravity, share, self._dt)
         self._momentum = momentum
         self.estimated = hand_force(to_heading.unsqueeze(1) @ self._arms.chains.jacobian(pose), self._torque)

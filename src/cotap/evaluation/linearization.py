@@ -119,7 +119,8 @@ def linearize(
     push[:, joints:] = torch.linalg.inv(inertia).flatten(0, 1)
     flow = torch.zeros(poses, 2 * joints, 2 * joints, dtype=q.dtype)
     flow[:, :joints, joints:] = torch.eye(joints, dtype=q.dtype)
-    springs = torch.cat((answer.stiffness + sag, answer.damping), -1).flatten(0, 1)
+    damping = answer.damping + arms.friction * torch.eye(joints, dtype=q.dtype)
+    springs = torch.cat((answer.stiffness + sag, damping), -1).flatten(0, 1)
     flow -= push @ springs
     return ClosedLoop(
         flow, push, arms.chains.jacobian(pose).flatten(0, 1), torch.stack(columns, -1).flatten(0, 1),

@@ -47,4 +47,4 @@ def arm_model(spec: RobotSpec) -> Arms:
     kp, kd, low, high, speed = torch.tensor(
         [[(j.kp, j.kd, *j.range_rad, j.velocity_limit_rad_s) for j in arm] for arm in joints]
     ).unbind(-1)
-    return Arms(arm_chains(spec), arm_inertias(spec), kp, kd, low, high, speed)
+    return Arms(arm_chains(spec), arm_inertias(spec), kp, kd, low, high, speed, spec.joint_damping)
