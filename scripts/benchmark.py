@@ -39,14 +39,16 @@ from cotap.agents.dual_ppo import DualPPO
 from cotap.agents.runner import layout_of
 from cotap.checks import require_positive_int, require_range
 from cotap.compliance import ArmKinematics
-from cotap.compliance.laws import Arms, ArmState, CoTaPLaw, LawConfig, LawParameters
+from cotap.compliance.interface import ArmState, LawParameters
+from cotap.compliance.inverse_kinematics import ArmIK
+from cotap.compliance.laws import LAWS, LawConfig
 from cotap.configs import BASE_RECIPES, BaseTraining
 from cotap.envs import H1Env, H1EnvConfig
 from cotap.envs.reference import ReferenceConfig, ReferenceMotion
 from cotap.evaluation.policy import load_policy, shipped_checkpoint
 from cotap.motions import MotionClip, MotionLibrary
 from cotap.robots import RobotSpec, h1
-from cotap.robots.chains import arm_chains, arm_gains, arm_inertias
+from cotap.robots.chains import arm_model
 from cotap.robots.mjcf import build_model
 
 PEER_ENVS = 32
@@ -162,10 +164,13 @@ class Training:
 class Compliance:
     """Both arms of every world, from joint angles to torque: kinematics, stiffness, blend, gravity, two torques."""
 
-    def __init__(self, num_envs: int, seconds: float) -> None:
+    def __init__(self, num_envs: int, seconds: float, law: str = "cotap") -> None:
         self.seconds, self.num_envs, spec = seconds, num_envs, h1()
-        self.chains = arm_chains(spec)
-        self.law = CoTaPLaw(Arms(self.chains, arm_inertias(spec), *arm_gains(spec)), LawConfig("cotap"))
+        self.arms = arm_model(spec)
+        self.chains = self.arms.chains
+        self.law = LAWS[law](self.arms, LawConfig(law))
+        self.force = torch.tensor([10.0, 0.0, -20.0]).repeat(num_envs, 2, 1)
+        self.fresh = torch.zeros(num_envs, dtype=torch.bool)
         joints = [spec.joints[i] for i in spec.indices(spec.upper_joints)]
         low, high = torch.tensor([j.range_rad for j in joints]).unbind(1)
         rng = torch.Generator().manual_seed(0)
@@ -176,13 +181,27 @@ class Compliance:
 
     def once(self) -> None:
         q = self.q
-        state = ArmState(q, q, q + 0.1, self.chains.pose(q), self.to_heading)
+        pose = self.chains.pose(q)
+        state = ArmState(q, q, q + 0.1, pose, self.to_heading, hand_force_h=self.force, fresh=self.fresh)
         law, _ = self.law(state, self.parameters)
         for _ in range(2):  # physics steps
             law.at(q, q)
 
     def run(self) -> float:
         return self.num_envs * _rate(self.once, self.seconds)
+
+
+class InverseKinematics(Compliance):
+    """Joint targets of both arms of every world for hands that are 2 cm away."""
+
+    def __init__(self, num_envs: int, seconds: float) -> None:
+        super().__init__(num_envs, seconds)
+        self.ik = ArmIK(self.chains, self.arms.low, self.arms.high)
+        self.tip = self.chains.pose(self.q).tip + 0.0115
+        self.most = 0.02 * self.arms.speed
+
+    def once(self) -> None:
+        self.ik(self.tip, self.q, self.q, self.most)
 
 
 class LiteralCompliance(Compliance):
@@ -389,6 +408,9 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     parts["reference"] = Reference(num_envs, seconds, 0).run
     parts["reference_10000_clips"] = Reference(num_envs, seconds, 10_000).run
     parts["compliance"] = Compliance(num_envs, seconds).run
+    for name in LAWS:
+        parts[f"law_{name}"] = Compliance(num_envs, seconds, name).run
+    parts["inverse_kinematics"] = InverseKinematics(num_envs, seconds).run
     parts["compliance_literal"] = LiteralCompliance(num_envs, seconds).run
     parts["mujoco_rollout"] = lambda: rollout_rate(recording, seconds)
     makers = [PlainEnv] * PEER_ENVS
@@ -421,6 +443,10 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
         "compliance_over_physics": ratio(results, "physics", to="compliance"),
         "compliance_literal_ms": 1e3 * num_envs / median["compliance_literal"],
         "compliance_literal_over_compliance": ratio(results, "compliance", to="compliance_literal"),
+        "inverse_kinematics_ms": 1e3 * num_envs / median["inverse_kinematics"],
+        "inverse_kinematics_over_physics": ratio(results, "physics", to="inverse_kinematics"),
+        "laws_ms": {name: 1e3 * num_envs / median[f"law_{name}"] for name in LAWS},
+        "laws_over_physics": {name: ratio(results, "physics", to=f"law_{name}") for name in LAWS},
         "peak_rss_mib": memory,
         "peers": {name: median[name] for name in PEERS},
         "rounds": results,
@@ -445,8 +471,18 @@ def table(result: dict[str, Any]) -> str:
         f"compliance of both arms: {result['compliance_ms']:.1f} ms, {result['compliance_over_physics']:.3f} of a "
         f"physics step; the literal pipeline takes {result['compliance_literal_over_compliance']:.1f} times as long"
     )
+    ik = (
+        f"inverse kinematics of both arms: {result['inverse_kinematics_ms']:.1f} ms, "
+        f"{result['inverse_kinematics_over_physics']:.3f} of a physics step"
+    )
+    laws = [
+        f"| {name} | {result['laws_ms'][name]:.1f} | {over:.3f} |" for name, over in result["laws_over_physics"].items()
+    ]
+    laws = ["", "| law of the arms, per control step | ms | over physics |", "|---|---|---|", *laws, ""]
     clips = f"10,000 clips beside generated arm motion cost {result['clips_over_env']:.2%} of an environment step"
-    return "\n".join([*lines, "", compliance, clips, f"\npeak memory of training: {result['peak_rss_mib']:,.0f} MiB"])
+    return "\n".join(
+        [*lines, *laws, compliance, ik, clips, f"\npeak memory of training: {result['peak_rss_mib']:,.0f} MiB"]
+    )
 
 
 def main() -> int:

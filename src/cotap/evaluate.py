@@ -25,6 +25,7 @@ from cotap.evaluation.periodic import PeriodicLoad
 from cotap.evaluation.protocols import VelocityTracking
 from cotap.evaluation.punches import PunchWalk
 from cotap.evaluation.scenario import Scenario
+from cotap.evaluation.stability import Stability
 from cotap.evaluation.static import StaticStiffness
 
 if TYPE_CHECKING:
@@ -132,6 +133,13 @@ class ModulationOptions(ScenarioOptions):
 
     laws: tyro.conf.OmitArgPrefixes[LawOptions] = field(default_factory=lambda: LawOptions(method="cotap"))
     protocol: tyro.conf.OmitArgPrefixes[Modulation] = field(default_factory=Modulation)
+
+
+@dataclass
+class StabilityOptions(CommonOptions):
+    """Linearised closed loop of an arm's law over random poses, and the energy that can be drawn from it."""
+
+    protocol: tyro.conf.OmitArgPrefixes[Stability] = field(default_factory=Stability)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -263,12 +271,13 @@ def velocity_tracking(options: VelocityTrackingOptions) -> dict[str, Any]:
 def static_stiffness(options: StaticStiffnessOptions) -> dict[str, Any]:
     """Measure, print the table, write what was asked for, and return the result."""
     from cotap.agents.checkpoint import write_json
+    from cotap.compliance.laws import WITHOUT_STIFFNESS
     from cotap.evaluation.static import measure, plot, summary, table
 
     protocol = options.protocol
     env, policy, checkpoint = _prepare(options, protocol)
     law = env.cfg.upper_body.of(protocol.hand)
-    commanded = law.stiffness if law.name == "cotap" else None
+    commanded = None if law.name in WITHOUT_STIFFNESS else law.stiffness
     start = time.perf_counter()
     measured = measure(env, protocol, policy)
     result = _result("static-stiffness", options, protocol, env, checkpoint) | {
@@ -371,9 +380,32 @@ def scenario(name: str, options: ScenarioOptions) -> dict[str, Any]:
     return result
 
 
+def stability(options: StabilityOptions) -> dict[str, Any]:
+    """Analyse and measure the left arm's law, print the tables, write what was asked for, and return the result."""
+    from cotap.agents.checkpoint import write_json
+    from cotap.evaluation.stability import energy_summary, exchanged_energy, growth_rates, table
+
+    protocol = options.protocol
+    env, _, checkpoint = _prepare(options, protocol)
+    start = time.perf_counter()
+    rates = growth_rates(env.spec, env.cfg.upper_body.left, protocol)
+    energy = energy_summary(exchanged_energy(env, protocol))
+    result = _result("stability", options, protocol, env, checkpoint) | {
+        "num_poses": protocol.poses,
+        "seconds": time.perf_counter() - start,
+        "linearised": rates,
+        "energy": energy,
+    }
+    print(table(result))
+    if options.json:
+        write_json(Path(options.json), result)
+    return result
+
+
 PROTOCOLS: dict[str, tuple[type[Any], Callable[[Any], dict[str, Any]]]] = {
     "velocity-tracking": (VelocityTrackingOptions, velocity_tracking),
     "static-stiffness": (StaticStiffnessOptions, static_stiffness),
+    "stability": (StabilityOptions, stability),
     "fidelity": (FidelityOptions, fidelity),
     "impact": (ImpactOptions, partial(scenario, "impact")),
     "constant-load": (ConstantLoadOptions, partial(scenario, "constant-load")),

@@ -42,8 +42,8 @@ class BaseOptions:
     """Checkpoint to go on from; its config is the default for every option."""
     recipe: str = "default"
     """default (from nothing to walking); paper (the same with the paper's networks); robust (blows and loads on the
-    hands: with --resume, what a policy that walks learns next, from nothing without it); or, for ablations,
-    torque-critic or goals (other observations)."""
+    hands: with --resume, what a policy that walks learns next, from nothing without it); for ablations,
+    torque-critic or goals (other observations), or facet (FACET's tracking reward)."""
     command: tyro.conf.Suppress[str] = ""
     training: Annotated[BaseTraining, tyro.conf.arg(name="")] = field(default_factory=BASE_RECIPES["default"])
 
@@ -62,7 +62,8 @@ class DistillOptions:
     base_checkpoint: str = ""
     """Base policy to begin from and to be guided by; by default the shipped one."""
     recipe: str = "default"
-    """default (80 to 1200 N/m); paper (150 to 450 N/m); or an ablation: no-ratio, torque-critic, goals."""
+    """default (80 to 1200 N/m); paper (150 to 450 N/m); facet (arms under FACET, its tracking reward);
+    or an ablation: no-ratio, torque-critic, goals."""
     command: tyro.conf.Suppress[str] = ""
     training: Annotated[DistillTraining, tyro.conf.arg(name="")] = field(default_factory=DistillTraining)
 

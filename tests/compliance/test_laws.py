@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from cotap.compliance.dynamics import gravity_torque
-from cotap.compliance.laws import Arms, ArmState, CoTaPLaw, LawConfig, LawParameters, PDLaw
+from cotap.compliance.interface import Arms, ArmState, LawParameters
+from cotap.compliance.laws import LAWS, CoTaPLaw, LawConfig, PDLaw
 from cotap.compliance.stiffness import resolve_joint_stiffness
-from cotap.robots.chains import arm_chains, arm_gains, arm_inertias
+from cotap.robots.chains import arm_model
 
 
 @pytest.fixture
 def arms(spec) -> Arms:
-    return Arms(arm_chains(spec), arm_inertias(spec), *arm_gains(spec))
+    return arm_model(spec)
 
 
 def a_state(arms: Arms, rng, n=6, moved=0.1, base=None) -> ArmState:
@@ -107,14 +110,42 @@ def test_gains_that_differ_are_refused(arms):
     kp = arms.kp.clone()
     kp[0, 0] = 50.0
     with pytest.raises(ValueError, match="cotap needs one position gain on all joints of an arm"):
-        CoTaPLaw(Arms(arms.chains, arms.inertias, kp, arms.kd), LawConfig())
+        CoTaPLaw(replace(arms, kp=kp), LawConfig())
 
 
 @pytest.mark.parametrize(
     ("field", "value"),
     [("name", "impedance"), ("error", "hand"), ("damping", "none"), ("stiffness", (0.0, 1.0, 1.0)),
-     ("null_stiffness", 0.0), ("alpha", 1.5), ("soft_gain", -1.0)],
+     ("null_stiffness", 0.0), ("alpha", 1.5), ("soft_gain", -1.0), ("virtual_mass", 0.0), ("damping_ratio", 0.0),
+     ("sensing", "guessed"), ("reference_share", 1.0)],
 )  # fmt: skip
 def test_bad_fields_are_named(field, value):
     with pytest.raises(ValueError, match=rf"law\.{field}"):
         LawConfig(**{field: value}).check()
+
+
+def test_hmc_adds_torques_by_weight(arms, rng):
+    state, p = a_state(arms, rng), parameters(stiffness=500.0)
+    q, dq = state.position, torch.full_like(state.position, 0.7)
+    jacobian = state.to_heading.unsqueeze(1) @ arms.chains.jacobian(state.pose)
+    reach = state.to_heading.unsqueeze(1) @ (arms.chains.pose(state.target).tip - state.pose.tip).unsqueeze(-1)
+    rate = jacobian @ dq.unsqueeze(-1)
+    force = 500.0 * reach - 2.0 * 0.7 * (500.0 * 2.0) ** 0.5 * rate
+    impedance = gravity_torque(arms.inertias, state.pose, state.to_heading[:, 2])
+    impedance = impedance + (jacobian.transpose(-1, -2) @ force).squeeze(-1)
+    pd = 100.0 * (state.target - q) - 2.0 * dq
+    for weight in (0.0, 0.3, 1.0):
+        p.alpha = torch.full((6, 2), weight)
+        torque, _ = LAWS["hmc"](arms, LawConfig("hmc", virtual_mass=2.0, damping_ratio=0.7))(state, p)
+        torch.testing.assert_close(torque.at(q, dq), weight * impedance + (1 - weight) * pd, atol=2e-3, rtol=1e-4)
+        moved = q + 1e-3
+        change = torque.at(moved, dq) - torque.at(q, dq)
+        expected = -weight * (jacobian.transpose(-1, -2) @ (500.0 * jacobian)) - (1 - weight) * 100.0 * torch.eye(4)
+        torch.testing.assert_close(change, 1e-3 * expected.sum(-1), atol=1e-3, rtol=1e-3)
+
+
+def test_arms_that_agree_but_for_what_worlds_vary_share_a_law():
+    one = LawConfig("facet", stiffness=(1.0, 2.0, 3.0), alpha=0.1)
+    assert one.kind() == LawConfig("facet").kind()
+    for other in (LawConfig("dcc"), LawConfig("facet", virtual_mass=2.0), LawConfig("facet", sensing="estimated")):
+        assert one.kind() != other.kind()

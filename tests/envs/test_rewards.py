@@ -97,7 +97,7 @@ BEST = {
     "track_yaw_rate": 1.0,
     "track_yaw_rate_closely": 1.0,
     "track_height": 1.0, "track_height_widely": 1.0, "contact_schedule": 1.0, "alive": 1.0, "track_arms": 1.0,
-    "stay_close": 1.0, "track_key_points": 1.0, "track_key_velocities": 1.0,
+    "stay_close": 1.0, "track_key_points": 1.0, "track_key_velocities": 1.0, "track_hands_as_facet": 1.0,
 }  # fmt: skip
 ALL_TERMS = sorted({f.name for group in (LowerRewards, UpperRewards) for f in dataclasses.fields(group)})
 
@@ -166,6 +166,9 @@ CASES = [
     ("track_arms", {"joint_pos": [[0, 0, 0, 0.3, -0.1]], "position": [[0.2, 0.1]]}, math.exp(-0.05 / 0.06)),
     ("track_key_points", {"key_points_t": [[[0.2, 0.2, 0.2], [0.2, -0.1, 0.1]]]}, math.exp(-0.02 / 0.01)),
     ("track_key_velocities", {"key_velocities_t": [[[0.5, 0, 0], [0, -1.0, 0]]]}, math.exp(-1.25)),
+    # One hand, one elbow: FACET judges the hand.
+    ("track_hands_as_facet", {"key_points_t": [[[0.2, 0.2, 0.4], [9.0, -0.1, 0.1]]]}, math.exp(-0.09)),
+    ("track_hands_as_facet", {"key_velocities_t": [[[0.5, 0, 0], [0, -1.0, 0]]]}, math.exp(-0.25)),
     ("arm_residual", {"action": [[9.0, 9.0, 9.0, 1.0, -2.0]]}, 5.0),
 ]  # fmt: skip
 

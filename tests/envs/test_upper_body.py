@@ -11,6 +11,7 @@ import torch
 
 from cotap.compliance.laws import LawConfig
 from cotap.envs.disturbances import HandForceConfig
+from cotap.envs.forces import ForceProfile
 from cotap.envs.randomization import RandomizationConfig
 from cotap.envs.upper_body import LawSampling, TorsoComplianceConfig, UpperBodyConfig
 
@@ -152,6 +153,78 @@ def test_gain_errors_scale_elastic_torque_and_damping_but_not_gravity(make_env):
     elastic = plain - gravity - viscous
     scaled = env.upper_body.torque(q, dq, now, 1.1 * ones, 0.9 * ones)
     torch.testing.assert_close(scaled, gravity + 1.1 * elastic + 0.9 * viscous, atol=1e-3, rtol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["facet", "cotap+facet-matched", "dcc"])
+@pytest.mark.parametrize("sensing", ["privileged", "estimated"])
+def test_a_run_of_laws_that_remember_goes_on_exactly(make_env, name, sensing):
+    """Virtual masses, moved targets and what hands have felt are part of the state, the first step included."""
+
+    def make():
+        arms = UpperBodyConfig(LawConfig(name, sensing=sensing), LawConfig("facet", virtual_mass=2.0))
+        return make_env(3, upper_body=arms, force=ForceProfile((20.0, 0.0, -20.0), "both", start_s=0.06))
+
+    env = make()
+    drive(env, 8)
+    saved = copy.deepcopy(env.state_dict())
+    expected = drive(env, 6, seed=1)
+    other = make()
+    other.load_state_dict(saved)
+    for mine, theirs in zip(drive(other, 6, seed=1), expected, strict=True):
+        assert torch.equal(mine, theirs)
+    with pytest.raises(ValueError, match="remember 0 states, got"):
+        make_env(3, upper_body=fresh(COTAP)).load_state_dict(saved)
+
+
+def test_a_restarted_world_has_a_hand_that_felt_nothing(make_env):
+    """The virtual mass of the world that fell starts over; the other's stays where its load has put it."""
+    facet = LawConfig("facet", stiffness=(500.0, 500.0, 500.0))
+    cfg = UpperBodyConfig(facet, copy.copy(facet))
+    load = ForceProfile((0.0, 0.0, -20.0), "left", start_s=0.02)
+    env = make_env(2, upper_body=cfg, force=load, hand_forces=HandForceConfig(enabled=False))
+    env.motions.hold(env.motions.default)
+    for _ in range(25):
+        env.step(torch.zeros(2, 19))
+    law = env.upper_body._laws[0][0]
+    shift = (law.memory["position_h"] - law.memory["wanted_h"]).norm(dim=-1)
+    assert shift[0].tolist() == pytest.approx([0.035, 0.0], abs=0.01)
+    env.sim.qpos[1, 3:7] = torch.tensor([0.5**0.5, 0.5**0.5, 0.0, 0.0])  # on its side
+    env.step(torch.zeros(2, 19))
+    assert env.upper_body.sensors.privileged[1].abs().max() == 0.0
+    env.step(torch.zeros(2, 19))
+    shift = (law.memory["position_h"] - law.memory["wanted_h"]).norm(dim=-1)
+    assert float(shift[1].max()) < 1e-6
+    assert float(shift[0, 0]) > 0.02
+
+
+def test_hands_feel_the_forces_of_the_step_before_in_the_heading_frame(make_env):
+    load = ForceProfile((5.0, -10.0, 15.0), "right", start_s=0.02)
+    env = make_env(2, upper_body=fresh(COTAP), force=load, hand_forces=HandForceConfig(enabled=False))
+    felt = []
+    for _ in range(3):
+        env.step(torch.zeros(2, 19))
+        felt.append(env.upper_body.sensors.privileged.clone())
+    assert felt[0].abs().max() == 0.0
+    for later in felt[1:]:
+        assert later[:, 0].abs().max() == 0.0
+        torch.testing.assert_close(later[:, 1], torch.tensor([5.0, -10.0, 15.0]).expand(2, 3), atol=0.3, rtol=0)
+
+
+@pytest.mark.parametrize("name", ["facet", "cotap"])
+def test_forces_are_estimated_from_arm_torques(make_env, name):
+    """Held loads, pelvis fixed, no torque sensor but the motors' own: within 5 % once arms are at rest."""
+    law = LawConfig(name, sensing="estimated", stiffness=(800.0, 800.0, 800.0))
+    env = make_env(
+        2, upper_body=UpperBodyConfig(law, copy.copy(law)), fixed_base=True,
+        randomization=RandomizationConfig(enabled=False),
+        force=ForceProfile((6.0, -4.0, -10.0), "left", start_s=0.0), hand_forces=HandForceConfig(enabled=False),
+    )  # fmt: skip
+    env.motions.hold(env.motions.default + torch.tensor([0.0, 0.2, 0.0, 0.3, 0.0, -0.2, 0.0, 0.3]))
+    env.reset()
+    for _ in range(150):
+        env.step(torch.zeros(2, 19))
+    expected = torch.tensor([[6.0, -4.0, -10.0], [0.0, 0.0, 0.0]]).expand(2, 2, 3)
+    torch.testing.assert_close(env.upper_body.sensors.estimated, expected, atol=0.6, rtol=0)
 
 
 @pytest.mark.parametrize("torso", ["none", "constant", "support"])

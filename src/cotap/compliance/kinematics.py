@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 
 import torch
@@ -47,6 +48,18 @@ class SerialChains:
         zero = torch.zeros_like(x)
         skew = torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), -1).unflatten(-1, (3, 3))
         self._sine, self._versine = self._fixed @ skew, self._fixed @ skew @ skew
+
+    def to(self, dtype: torch.dtype) -> SerialChains:
+        """The same chains in another precision."""
+        out = copy.copy(self)
+        for name in ("offsets", "axes", "tip", "_fixed", "_sine", "_versine"):
+            setattr(out, name, getattr(self, name).to(dtype))
+        return out
+
+    @property
+    def rodrigues(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Matrices F, S and V, (A, n, 3, 3), of rotations into the links' parents, `F + sin(q) S + (1 - cos(q)) V`."""
+        return self._fixed, self._sine, self._versine
 
     def pose(self, q: torch.Tensor) -> ChainPose:
         """Pose of every link for joint angles `q` (W, A, n) [rad]."""

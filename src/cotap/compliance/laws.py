@@ -1,25 +1,23 @@
-"""Upper-body laws: how arms answer to their targets and to forces. One interface, laws chosen by name.
-
-A law is asked once a control step and answers with a torque that is affine in the joints' state,
-`tau(q, dq) = feedforward + elastic - K (q - anchor) - D dq`, which then acts at the physics rate.
-"""
+"""Upper-body laws by name: how arms answer to their targets and to forces, behind one interface."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Protocol
+from dataclasses import dataclass, fields
 
 import torch
 
 from cotap.checks import require_one_of, require_range
-from cotap.compliance.dynamics import LinkInertias, critical_damping, gravity_torque, joint_inertia
+from cotap.compliance.admittance import AdmittanceLaw, StaticShift, VirtualMass
+from cotap.compliance.dynamics import critical_damping, gravity_torque, joint_inertia
 from cotap.compliance.fast import ArmStiffness, blended_stiffness, inverse_3x3
-from cotap.compliance.kinematics import ChainPose, SerialChains
+from cotap.compliance.impedance import BlendedTorqueLaw
+from cotap.compliance.interface import Arms, ArmState, LawParameters, LawReport, TorqueLaw, UpperBodyLaw
 from cotap.compliance.stiffness import project_compliance
 
 ERRORS = ("joint", "task")
 DAMPINGS = ("pd", "critical")
+SENSING = ("privileged", "estimated")
 
 
 @dataclass
@@ -27,115 +25,48 @@ class LawConfig:
     """One arm's law and its parameters as every world has them at first."""
 
     name: str = "pd"
-    """pd, soft-pd or cotap."""
+    """pd, soft-pd, cotap, facet, cotap+facet, cotap+facet-matched, hmc or dcc."""
     stiffness: tuple[float, float, float] = (300.0, 300.0, 300.0)
-    """Hand stiffness K_ee along x, y and z of the heading frame [N/m] (cotap)."""
+    """Hand stiffness K_ee along x, y and z of the heading frame [N/m] (all but pd and soft-pd)."""
     null_stiffness: float = 40.0
     """Stiffness k_null of arm motion that leaves the hand where it is [Nm/rad] (cotap)."""
     alpha: float = 1.0
-    """Share of compliance in the blend with PD: 1 all compliance, 0 all PD, with gravity compensation (cotap)."""
+    """Share of compliance in its blend with PD: 1 all compliance, 0 all PD. Of stiffness and with gravity compensation
+    under cotap, of torques under hmc."""
     error: str = "joint"
     """joint: stiffness acts on joint errors (the paper). task: on the hand's, exact at any displacement (cotap)."""
     damping: str = "pd"
     """pd: the PD law's. critical: from stiffness and joint-space inertia (cotap)."""
     soft_gain: float = 30.0
     """Position gain [Nm/rad] (soft-pd)."""
+    virtual_mass: float = 1.0
+    """Mass of the hand's model [kg] (facet; hmc takes its damping from it)."""
+    damping_ratio: float = 1.0
+    """Damping of the hand's model, as a share of critical (facet, hmc)."""
+    sensing: str = "privileged"
+    """Force on the hand: privileged, from the simulation, or estimated, from arm torques (facet, dcc)."""
+    reference_share: float = 0.5
+    """Share of the compliance that the moving reference provides; the arm does the rest (cotap+facet-matched)."""
 
     def check(self, where: str = "law") -> None:
         """Raise ValueError naming the first field, under `where`, that is out of its range."""
         require_one_of(f"{where}.name", self.name, LAWS.keys())
         require_one_of(f"{where}.error", self.error, ERRORS)
         require_one_of(f"{where}.damping", self.damping, DAMPINGS)
+        require_one_of(f"{where}.sensing", self.sensing, SENSING)
         for i, value in enumerate(self.stiffness):
             require_range(f"{where}.stiffness[{i}]", value, 1.0, 1e5)
         require_range(f"{where}.null_stiffness", self.null_stiffness, 0.1, 1e4)
         require_range(f"{where}.alpha", self.alpha, 0.0, 1.0)
         require_range(f"{where}.soft_gain", self.soft_gain, 0.1, 1e4)
+        require_range(f"{where}.virtual_mass", self.virtual_mass, 0.01, 1e3)
+        require_range(f"{where}.damping_ratio", self.damping_ratio, 0.01, 100.0)
+        require_range(f"{where}.reference_share", self.reference_share, 0.01, 0.99)
 
-
-@dataclass
-class LawParameters:
-    """What may differ between worlds and change at any step. N worlds, A arms."""
-
-    stiffness: torch.Tensor
-    """(N, A, 3) hand stiffness along the axes of the heading frame [N/m]."""
-    null_stiffness: torch.Tensor
-    """(N, A) [Nm/rad]."""
-    alpha: torch.Tensor
-    """(N, A) in [0, 1]."""
-
-
-@dataclass(frozen=True)
-class Arms:
-    """What a law may know of the arms it drives: nominal gains, limits, masses, kinematics. A arms of n joints."""
-
-    chains: SerialChains
-    inertias: LinkInertias
-    kp: torch.Tensor
-    """(A, n) PD position gains [Nm/rad]."""
-    kd: torch.Tensor
-    """(A, n) PD damping gains [Nms/rad]."""
-
-
-@dataclass(frozen=True)
-class ArmState:
-    """What a law senses at the start of a control step."""
-
-    position: torch.Tensor
-    """(N, A, n) joint angles [rad]."""
-    velocity: torch.Tensor
-    """(N, A, n) [rad/s]."""
-    target: torch.Tensor
-    """(N, A, n) joint angles that are wanted [rad]."""
-    pose: ChainPose
-    """The arms in the torso frame."""
-    to_heading: torch.Tensor
-    """(N, 3, 3) from the torso to the heading frame."""
-    base_compliance_h: torch.Tensor | None = None
-    """(N, A, 3, 3) the hands' compliance through a moving torso, heading frame [m/N]; None counts as none."""
-
-
-@dataclass(frozen=True)
-class TorqueLaw:
-    """`tau(q, dq) = feedforward + elastic - K (q - anchor) - D dq`, for one control step."""
-
-    anchor: torch.Tensor
-    """(N, A, n) [rad]."""
-    feedforward: torch.Tensor
-    """(N, A, n) what does not depend on the target [Nm]."""
-    elastic: torch.Tensor
-    """(N, A, n) K times the error at the anchor [Nm]."""
-    stiffness: torch.Tensor
-    """(N, A, n, n) [Nm/rad]."""
-    damping: torch.Tensor
-    """(N, A, n, n) [Nms/rad]."""
-
-    def at(
-        self,
-        q: torch.Tensor,
-        dq: torch.Tensor,
-        kp_scale: torch.Tensor | float = 1.0,
-        kd_scale: torch.Tensor | float = 1.0,
-    ) -> torch.Tensor:
-        """Torques (N, A, n) [Nm] at joint angles and rates (N, A, n), gains off by these factors."""
-        elastic = self.elastic - (self.stiffness * (q - self.anchor).unsqueeze(-2)).sum(-1)
-        viscous = (self.damping * dq.unsqueeze(-2)).sum(-1)
-        return self.feedforward + kp_scale * elastic - kd_scale * viscous
-
-
-@dataclass
-class LawReport:
-    """What a law did in one step, for the log; (N, A) each. Laws that blend nothing leave it empty."""
-
-    values: dict[str, torch.Tensor] = field(default_factory=dict)
-
-
-class UpperBodyLaw(Protocol):
-    """How one kind of law is asked. To add one, write a class with this method and name it in `LAWS`."""
-
-    def __call__(self, state: ArmState, parameters: LawParameters) -> tuple[TorqueLaw, LawReport]:
-        """The torque law of this control step."""
-        ...
+    def kind(self) -> tuple[object, ...]:
+        """All that is not a parameter of worlds: arms that agree in it are driven by one law."""
+        own = {f.name for f in fields(LawParameters)}
+        return tuple(getattr(self, f.name) for f in fields(self) if f.name not in own)
 
 
 class PDLaw:
@@ -222,9 +153,30 @@ def _arm_stiffness(
     return 0.5 * (inverse + inverse.transpose(-1, -2)), projected
 
 
+def _facet(
+    arms: Arms, cfg: LawConfig, tracking: UpperBodyLaw, model_scale: float = 1.0, tracking_scale: float = 1.0
+) -> AdmittanceLaw:
+    """The reference as a virtual mass, tracked by another law."""
+    return AdmittanceLaw(arms, VirtualMass(cfg.virtual_mass, cfg.damping_ratio), tracking, model_scale, tracking_scale)
+
+
+def _matched(arms: Arms, cfg: LawConfig) -> AdmittanceLaw:
+    """Reference and arm each so stiff that their compliances add to the one that is asked for."""
+    share = cfg.reference_share
+    return _facet(arms, cfg, CoTaPLaw(arms, cfg), 1.0 / share, 1.0 / (1.0 - share))
+
+
 LAWS: dict[str, Callable[[Arms, LawConfig], UpperBodyLaw]] = {
     "pd": lambda arms, _: PDLaw(arms),
     "soft-pd": lambda arms, cfg: PDLaw(arms, cfg.soft_gain),
     "cotap": CoTaPLaw,
+    "facet": lambda arms, cfg: _facet(arms, cfg, PDLaw(arms)),
+    "cotap+facet": lambda arms, cfg: _facet(arms, cfg, CoTaPLaw(arms, cfg)),
+    "cotap+facet-matched": _matched,
+    "hmc": lambda arms, cfg: BlendedTorqueLaw(arms, cfg.virtual_mass, cfg.damping_ratio),
+    "dcc": lambda arms, _: AdmittanceLaw(arms, StaticShift(), PDLaw(arms)),
 }
 """Every law, by name."""
+
+WITHOUT_STIFFNESS = ("pd", "soft-pd")
+"""Laws that command no stiffness of the hand."""

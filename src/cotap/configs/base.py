@@ -91,12 +91,27 @@ def goals() -> BaseTraining:
     return training
 
 
+def facet() -> BaseTraining:
+    """FACET as the paper trains it: PD arms, its tracking reward on the data's own motion, no moving reference."""
+    training = default()
+    reward_as_facet(training.env)
+    return training
+
+
+def reward_as_facet(env: H1EnvConfig) -> None:
+    """FACET's tracking reward of the hands takes the place of that of key points, at their weight."""
+    upper = env.rewards.upper
+    upper.track_hands_as_facet += upper.track_key_points + upper.track_key_velocities
+    upper.track_key_points = upper.track_key_velocities = 0.0
+
+
 BASE_RECIPES: dict[str, Callable[[], BaseTraining]] = {
     "default": default,
     "paper": paper,
     "robust": robust,
     "torque-critic": torque_critic,
     "goals": goals,
+    "facet": facet,
 }
 """Stage 1, by name."""
 CONTINUATIONS: dict[str, Callable[[BaseTraining], BaseTraining]] = {"robust": robust}

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from cotap.agents.distillation import DistillationConfig
-from cotap.configs.base import BaseTraining
+from cotap.configs.base import BaseTraining, reward_as_facet
 
 
 @dataclass
@@ -81,11 +81,21 @@ def _require_base(recipe: str, fits: bool) -> None:
         )
 
 
+def facet(base: BaseTraining) -> DistillTraining:
+    """Arms under FACET, its tracking reward in place of that of key points."""
+    training = default(base)
+    env = training.env
+    env.upper_body.left.name = env.upper_body.right.name = "facet"
+    reward_as_facet(env)
+    return training
+
+
 DISTILL_RECIPES: dict[str, Callable[[BaseTraining], DistillTraining]] = {
     "default": default,
     "paper": paper,
     "no-ratio": no_ratio,
     "torque-critic": torque_critic,
     "goals": goals,
+    "facet": facet,
 }
 """Stage 2, by name."""

@@ -223,7 +223,7 @@ class H1Env(VecEnv):
         self.punches = Punches(cfg.punches, n, self.num_actions - self.num_lower, self.dt)
         self.assistance = Assistance(cfg.assist, n, self.dt)
         self.randomizer = Randomizer(cfg.randomization, spec, self.sim)
-        self.upper_body = UpperBody(cfg.upper_body, spec, n)
+        self.upper_body = UpperBody(cfg.upper_body, spec, n, self.dt)
         self.targets = DelayedTargets(n, self.num_actions, cfg.substeps, self.dt)
         num_upper, sees = self.num_actions - self.num_lower, cfg.observations.arm_torque == "actor"
         goals = GOALS_PER_ARM * len(spec.arms) * cfg.observations.goals
@@ -244,6 +244,7 @@ class H1Env(VecEnv):
         self._last_action = torch.zeros(n, self.num_actions)
         self._mean_error = torch.zeros(n, 3)
         self._hand_force_w = torch.zeros(n, len(spec.arms), 3)
+        self._arm_effort = torch.zeros(n, self.num_actions - self.num_lower)
         self._kp, self._kd = self.randomizer.gains()
         self.randomizer.randomize_bodies(self.rng)
         self.state: RobotState
@@ -325,6 +326,8 @@ class H1Env(VecEnv):
         s = self.state
         self.commands.step(self.rng, leaning(s.projected_gravity_t, s.torso_angular_velocity_t))
         self._follow_path()
+        if self.upper_body.active:
+            self.upper_body.sense(s, self._hand_force_w, self._arm_effort)
         self.upper_body.step(self.dt, self.rng)
         self.hand_forces.step(self.rng)
         self.punches.step(self.rng)
@@ -431,6 +434,7 @@ class H1Env(VecEnv):
         if not self.upper_body.active:
             return
         arms = slice(self.num_lower, None)
+        self._arm_effort.zero_()
         self.upper_body.send(self.state, self.targets.current[:, arms])
         kp, kd = self.upper_body.implicit_gains()
         self._kp[:, arms], self._kd[:, arms] = kp, kd
@@ -444,9 +448,10 @@ class H1Env(VecEnv):
             arms = slice(self.num_lower, None)
             q = self.sim.qpos[:, 7 + self.num_lower :].float()
             dq = self.sim.qvel[:, 6 + self.num_lower :].float()
-            control[:, arms] = (
-                self._arm_torque(q, dq, self.targets.arrived(substep)) + self._kp[:, arms] * q + self._kd[:, arms] * dq
-            )
+            torque = self._arm_torque(q, dq, self.targets.arrived(substep))
+            limit = self._torque_limit[arms]
+            self._arm_effort += torque.clamp(-limit, limit) / self.cfg.substeps
+            control[:, arms] = torque + self._kp[:, arms] * q + self._kd[:, arms] * dq
         return control
 
     def _arm_torque(self, q: torch.Tensor, dq: torch.Tensor, arrived: torch.Tensor) -> torch.Tensor:

@@ -101,6 +101,7 @@ class UpperRewards:
     track_arms: float = 1.0
     track_key_points: float = 1.0
     track_key_velocities: float = 0.3
+    track_hands_as_facet: float = 0.0
     arm_residual: float = -0.02
     upper_torque: float = -2e-5
     upper_acceleration: float = -1e-7
@@ -283,6 +284,17 @@ def track_key_velocities(s: StepRecord) -> torch.Tensor:
     return torch.exp(-(s.key_velocities_t - s.key_velocities_reference_t).square().sum((1, 2)))
 
 
+def track_hands_as_facet(s: StepRecord) -> torch.Tensor:
+    """FACET's reward: position and velocity of each hand against the reference, mean over hands (paper, appendix D).
+
+    On the data's own motion, as the paper trains it: the reference is not moved by forces.
+    """
+    hands = s.key_points_t.shape[1] // 2  # as many elbows follow
+    position = (s.key_points_reference_t - s.key_points_t)[:, :hands].square().sum(-1)
+    velocity = (s.key_velocities_reference_t - s.key_velocities_t)[:, :hands].square().sum(-1)
+    return torch.exp(-velocity - position).mean(1)
+
+
 def arm_residual(s: StepRecord) -> torch.Tensor:
     """Squared residual action of the arms."""
     return s.action[:, s.num_lower :].square().sum(1)
@@ -351,6 +363,7 @@ TERMS: dict[str, Callable[[StepRecord], torch.Tensor]] = {
         track_arms,
         track_key_points,
         track_key_velocities,
+        track_hands_as_facet,
         arm_residual,
         upper_torque,
         upper_acceleration,

@@ -10,12 +10,14 @@ import torch
 
 from cotap.checks import require_interval, require_one_of, require_range
 from cotap.compliance import singularity_aware_ratio
-from cotap.compliance.laws import LAWS, Arms, ArmState, LawConfig, LawParameters, TorqueLaw
+from cotap.compliance.interface import ArmState, LawParameters, Remembering, TorqueLaw
+from cotap.compliance.laws import LAWS, LawConfig
 from cotap.compliance.torso import chain_compliance, hand_base_compliance, torso_compliance
+from cotap.envs.hand_sensing import HandSensors
 from cotap.envs.persistence import Stateful, uniform
 from cotap.envs.state import RobotState
 from cotap.robots import RobotSpec
-from cotap.robots.chains import arm_chains, arm_gains, arm_inertias, chains_between
+from cotap.robots.chains import arm_model, chains_between
 
 TORSO_MODELS = ("none", "constant", "support")
 
@@ -97,19 +99,20 @@ class UpperBody(Stateful):
 
     STATE = ("fresh", "_hold_s", "_anchor", "_feedforward", "_elastic", "_stiffness", "_damping")
 
-    def __init__(self, cfg: UpperBodyConfig, spec: RobotSpec, num_envs: int) -> None:
+    def __init__(self, cfg: UpperBodyConfig, spec: RobotSpec, num_envs: int, dt: float) -> None:
         cfg.check()
-        self._cfg, self._spec = cfg, spec
-        self._chains = chains = arm_chains(spec)
-        arms = Arms(chains, arm_inertias(spec), *arm_gains(spec))
+        self._cfg, self._spec, self._dt = cfg, spec, dt
+        arms = arm_model(spec)
+        self._chains = arms.chains
         configs = [cfg.of(arm.side) for arm in spec.arms]
         self.active = any(c.name != "pd" for c in configs)
         """Whether any arm is under a law that plain PD actuators do not implement by themselves."""
         self._laws = []
-        for kind in dict.fromkeys((c.name, c.error, c.damping, c.soft_gain) for c in configs):
-            chosen = [(c.name, c.error, c.damping, c.soft_gain) == kind for c in configs]
-            law = LAWS[kind[0]](arms, next(c for c, mine in zip(configs, chosen, strict=True) if mine))
-            self._laws.append((law, torch.tensor(chosen)))
+        for kind in dict.fromkeys(c.kind() for c in configs):
+            chosen = [c.kind() == kind for c in configs]
+            law = next(c for c, mine in zip(configs, chosen, strict=True) if mine)
+            self._laws.append((LAWS[law.name](arms, law), law.sensing, torch.tensor(chosen)))
+        self.sensors = HandSensors(arms, num_envs, dt, any(c.sensing == "estimated" for c in configs))
         n, a, j = num_envs, len(configs), len(spec.arms[0].joints)
         self.parameters = LawParameters(
             torch.tensor([c.stiffness for c in configs]).repeat(n, 1, 1),
@@ -129,6 +132,7 @@ class UpperBody(Stateful):
     def reset(self, mask: torch.Tensor, rng: torch.Generator) -> None:
         """The next command of the worlds in `mask` has none before it; their parameters are drawn anew."""
         self.fresh = self.fresh | mask
+        self.sensors.reset(mask)
         if self._cfg.sampling.enabled:
             self._sample(mask, rng)
 
@@ -157,7 +161,7 @@ class UpperBody(Stateful):
         )
         to_heading = state.heading_w.transpose(1, 2) @ state.torso_rotation_w
         base = self._torso.hand_compliance(state, to_heading)
-        arms = ArmState(q, dq, wanted, state.arms, to_heading, base)
+        arms = ArmState(q, dq, wanted, state.arms, to_heading, base, fresh=self.fresh, dt=self._dt)
         new, self.log = self._ask(arms)
         tensors = (new.anchor, new.feedforward, new.elastic, new.stiffness, new.damping)
         for name, value in zip(self.STATE[2:], tensors, strict=True):
@@ -165,6 +169,17 @@ class UpperBody(Stateful):
             before = torch.where(self.fresh.reshape(-1, *[1] * (value.dim() - 1)), value, held[1])
             setattr(self, name, torch.stack((before, value)))
         self.fresh = torch.zeros_like(self.fresh)
+
+    def sense(self, state: RobotState, force_w: torch.Tensor, effort: torch.Tensor) -> None:
+        """Let the laws know what has just happened to the arms.
+
+        Args:
+            state: At the end of a control step.
+            force_w: (N, A, 3) on the hands during it, world frame [N].
+            effort: (N, U) mean torque of the arms' motors over it [Nm]; read only for estimates of the force.
+        """
+        q, dq = (self._upper(x).reshape(self._shape) for x in (state.joint_pos, state.joint_vel))
+        self.sensors.sense(state, q, dq, force_w, effort.reshape(self._shape))
 
     def torque(
         self, q: torch.Tensor, dq: torch.Tensor, arrived: torch.Tensor, kp_scale: torch.Tensor, kd_scale: torch.Tensor
@@ -191,16 +206,30 @@ class UpperBody(Stateful):
         return stiffness, damping
 
     def state_dict(self) -> dict[str, Any]:
-        """Its own state and the laws' parameters."""
+        """Its own state, the laws' parameters and memories, and what hands have felt."""
         p = self.parameters
         own = {"stiffness": p.stiffness.clone(), "null_stiffness": p.null_stiffness.clone(), "alpha": p.alpha.clone()}
-        return super().state_dict() | {"parameters": own}
+        memories = [{k: v.clone() for k, v in law.memory.items()} for law in self._remembering()]
+        return super().state_dict() | {
+            "parameters": own, "sensors": self.sensors.state_dict(), "memories": memories,
+        }  # fmt: skip
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take over what `state_dict` returned. Raises ValueError for another size or a missing name."""
         own = dict(state)
         self.parameters = LawParameters(**{k: v.clone() for k, v in own.pop("parameters").items()})
+        # States from before laws had senses and memories are of laws that need none.
+        if "sensors" in own:
+            self.sensors.load_state_dict(own.pop("sensors"))
+        memories, remembering = own.pop("memories", []), self._remembering()
+        if len(memories) != len(remembering):
+            raise ValueError(f"the arms' laws remember {len(remembering)} states, got {len(memories)}")
+        for law, memory in zip(remembering, memories, strict=True):
+            law.memory = {k: v.clone() for k, v in memory.items()}
         super().load_state_dict(own)
+
+    def _remembering(self) -> list[Remembering]:
+        return [law for law, *_ in self._laws if isinstance(law, Remembering)]
 
     def _upper(self, joints: torch.Tensor) -> torch.Tensor:
         return joints[:, len(self._spec.lower_joints) :]
@@ -225,8 +254,9 @@ class UpperBody(Stateful):
         merged: TorqueLaw | None = None
         log: dict[str, torch.Tensor] = {}
         parameters = self.parameters if self._cfg.singularity_ratio else self._undiminished(arms)
-        for law, mine in self._laws:
-            answer, report = law(arms, parameters)
+        for law, sensing, mine in self._laws:
+            force = self.sensors.estimated if sensing == "estimated" else self.sensors.privileged
+            answer, report = law(replace(arms, hand_force_h=force), parameters)
             log.update({f"/law/{k}": v[:, mine].mean() for k, v in report.values.items()})
             merged = answer if merged is None else _choose(mine, answer, merged)
         assert merged is not None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 from cotap.checks import require_one_of, require_range
 from cotap.compliance.laws import LAWS, LawConfig
@@ -14,17 +15,25 @@ class LawOptions:
     """Laws of the arms."""
 
     method: str = "pd"
-    """Upper-body law of both arms: pd, soft-pd or cotap."""
+    """Upper-body law of both arms: pd, soft-pd, cotap, facet, cotap+facet, cotap+facet-matched, hmc or dcc."""
     stiffness: tuple[float, ...] = (300.0,)
     """Hand stiffness, one number or X Y Z, heading frame [N/m]."""
     null_stiffness: float = 25.0
     """Stiffness of arm motion that leaves the hand where it is [Nm/rad]."""
     alpha: float = 1.0
-    """Share of compliance in its blend with PD."""
+    """Share of compliance in its blend with PD (cotap, hmc)."""
     error: str = "joint"
     """What stiffness acts on: joint or task error."""
     damping: str = "pd"
     """pd or critical."""
+    virtual_mass: float = 1.0
+    """Mass of the hand's model [kg] (facet, hmc)."""
+    damping_ratio: float = 1.0
+    """Damping of the hand's model, as a share of critical (facet, hmc)."""
+    sensing: str = "privileged"
+    """Force on the hand: privileged or estimated, from arm torques (facet, dcc)."""
+    reference_share: float = 0.5
+    """Share of the compliance that the moving reference provides (cotap+facet-matched)."""
     torso_compliance: str = "none"
     """What is put down to the torso: none, constant or support."""
     left: str = ""
@@ -34,9 +43,8 @@ class LawOptions:
 
     def configure(self) -> UpperBodyConfig:
         """The config of the arms. Raises ValueError naming what is wrong."""
-        common = LawConfig(
-            self.method, _three(self.stiffness), self.null_stiffness, self.alpha, self.error, self.damping
-        )
+        own: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(LawConfig) if hasattr(self, f.name)}
+        common = LawConfig(self.method, **(own | {"stiffness": _three(self.stiffness)}))
         out = UpperBodyConfig(
             parse_law("left", self.left, common) if self.left else common,
             parse_law("right", self.right, common) if self.right else replace(common),
@@ -61,7 +69,7 @@ def parse_law(option: str, text: str, common: LawConfig) -> LawConfig:
         require_one_of(f"--{option} field", key, known.keys())
         if not equals:
             raise ValueError(f"--{option}: {key} needs a value, as in {key}=...")
-        if key in ("error", "damping"):
+        if known[key] == "str":
             law = replace(law, **{key: value})
             continue
         try:

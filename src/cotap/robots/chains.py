@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 
 from cotap.compliance.dynamics import LinkInertias
+from cotap.compliance.interface import Arms
 from cotap.compliance.kinematics import SerialChains
 from cotap.robots.spec import RobotSpec
 from cotap.rotations import matrix_from_quat
@@ -40,7 +41,10 @@ def arm_inertias(spec: RobotSpec) -> LinkInertias:
     )
 
 
-def arm_gains(spec: RobotSpec) -> tuple[torch.Tensor, torch.Tensor]:
-    """Nominal kp [Nm/rad] and kd [Nms/rad] of the arms' joints, (A, n) each."""
+def arm_model(spec: RobotSpec) -> Arms:
+    """All that laws may know of the arms: nominal kinematics, masses, gains and limits."""
     joints = [[spec.joints[i] for i in spec.indices(arm.joints)] for arm in spec.arms]
-    return torch.tensor([[j.kp for j in arm] for arm in joints]), torch.tensor([[j.kd for j in arm] for arm in joints])
+    kp, kd, low, high, speed = torch.tensor(
+        [[(j.kp, j.kd, *j.range_rad, j.velocity_limit_rad_s) for j in arm] for arm in joints]
+    ).unbind(-1)
+    return Arms(arm_chains(spec), arm_inertias(spec), kp, kd, low, high, speed, spec.joint_damping)

@@ -1,0 +1,210 @@
+"""Whether arms under a law can be made to go unstable, and how much energy can be drawn from them; pelvis fixed."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from cotap.checks import require_positive_int, require_range
+from cotap.compliance.interface import LawParameters
+from cotap.compliance.laws import LAWS, LawConfig
+from cotap.envs import H1Env, H1EnvConfig
+from cotap.envs.persistence import uniform
+from cotap.evaluation.linearization import linearize
+from cotap.robots import RobotSpec
+from cotap.robots.chains import arm_model
+
+NOTHING_J = 1e-3
+"""Energy that a trial may lack before it counts as drawn: what rounding and sampling make of none."""
+_CHUNK = 1000
+
+
+@dataclass
+class Stability:
+    """Linearised closed loop over random poses, and the energy that forces on the hands can draw."""
+
+    poses: int = 10_000
+    """Arm poses to linearise at, uniform within the joints' limits."""
+    walls: tuple[float, ...] = (0.0, 100.0, 1000.0, 10000.0)
+    """Springs that hold the hand while it is linearised; 0 leaves it free [N/m]."""
+    load_rad: float = 0.1
+    """Standard deviation of joint errors at which loops are linearised as well, as a load makes them [rad]."""
+    num_envs: int = 256
+    """Trials of energy: in half of them the stiffness changes meanwhile."""
+    seconds: float = 5.0
+    """Length of a trial [s]."""
+    settle_seconds: float = 6.0
+    """Rest before it [s]."""
+    force: float = 10.0
+    """Amplitude of the swinging force on each hand, in a random direction [N]."""
+    frequency: tuple[float, float] = (0.2, 8.0)
+    """Of the force, log-uniform [Hz]."""
+    change_factor: float = 4.0
+    """Stiffness changes between 1 / sqrt(factor) and sqrt(factor) of the one commanded."""
+    change_seconds: float = 0.5
+    """How long it stays there [s]."""
+    seed: int = 0
+    """Seed of poses, forces and changes."""
+
+    def check(self) -> None:
+        """Raise ValueError naming the first field that is out of its range."""
+        require_positive_int("poses", self.poses)
+        require_range("num_envs", self.num_envs, 2, 1_000_000)
+        for i, wall in enumerate(self.walls):
+            require_range(f"walls[{i}]", wall, 0.0, 1e7)
+        require_range("load_rad", self.load_rad, 0.0, math.pi)
+        require_range("seconds", self.seconds, 0.1, 3600.0)
+        require_range("settle_seconds", self.settle_seconds, 0.1, 3600.0)
+        require_range("force", self.force, 0.1, 1000.0)
+        require_range("frequency[0]", self.frequency[0], 0.01, 25.0)
+        require_range("frequency[1]", self.frequency[1], self.frequency[0], 25.0)
+        require_range("change_factor", self.change_factor, 1.0, 1000.0)
+        require_range("change_seconds", self.change_seconds, 0.02, 3600.0)
+
+    def configure(self, env: H1EnvConfig) -> H1EnvConfig:
+        """Turn an environment into that of the trials of energy. Changes and returns `env`."""
+        self.check()
+        env.num_envs, env.seed, env.fixed_base = self.num_envs, self.seed, True
+        env.assist.enabled = env.hand_forces.enabled = env.randomization.enabled = False
+        env.observations.noise.enabled = False
+        env.motions.clips.share = 0.0
+        env.terminations.episode_s = 1e6
+        env.force.force = (0.0, 0.0, 0.0)
+        return env
+
+
+def random_poses(spec: RobotSpec, count: int, rng: torch.Generator) -> torch.Tensor:
+    """Arm poses (count, A, n), uniform within 98 % of the joints' range [rad]."""
+    arms = arm_model(spec)
+    center, half = (arms.low + arms.high) / 2.0, 0.98 * (arms.high - arms.low) / 2.0
+    return center + half * uniform(rng, -1.0, 1.0, count, *center.shape)
+
+
+def growth_rates(spec: RobotSpec, law: LawConfig, protocol: Stability) -> list[dict[str, float]]:
+    """Largest real part of the linearised loop per wall, at rest and loaded: the largest, and how many are positive."""
+    rng = torch.Generator().manual_seed(protocol.seed)
+    arms = arm_model(spec)
+    q = random_poses(spec, -(-protocol.poses // len(spec.arms)), rng)
+    loads = (0.0, protocol.load_rad) if protocol.load_rad else (0.0,)
+    rows = []
+    for load in loads:
+        target = (q + load * torch.randn(q.shape, generator=rng)).clamp(arms.low, arms.high)
+        rates: list[list[torch.Tensor]] = [[] for _ in protocol.walls]
+        for part in torch.arange(len(q)).split(_CHUNK):
+            shape = (len(part), len(spec.arms))
+            parameters = LawParameters(
+                torch.tensor(law.stiffness).expand(*shape, 3), torch.full(shape, law.null_stiffness),
+                torch.full(shape, law.alpha),
+            )  # fmt: skip
+            loop = linearize(lambda a: LAWS[law.name](a, law), arms, q[part], target[part], parameters)
+            for found, wall in zip(rates, protocol.walls, strict=True):
+                found.append(loop.growth(wall))
+        for found, wall in zip(rates, protocol.walls, strict=True):
+            rate = torch.cat(found)[: protocol.poses]
+            rows.append(
+                {
+                    "load_rad": load,
+                    "wall": wall,
+                    "largest_real_part": float(rate.max()),
+                    "share_unstable": float((rate > 1e-6).double().mean()),
+                }
+            )
+    return rows
+
+
+class SwingingForces:
+    """Forces on the hands that swing, each trial with a direction and a frequency of its own; heading frame."""
+
+    active = True
+
+    def __init__(self, protocol: Stability, num_hands: int, rng: torch.Generator) -> None:
+        n = protocol.num_envs
+        direction = torch.randn(n, num_hands, 3, generator=rng)
+        self._amplitude = protocol.force * direction / direction.norm(dim=-1, keepdim=True)
+        low, high = (math.log(bound) for bound in protocol.frequency)
+        self._rate = 2.0 * math.pi * uniform(rng, low, high, n, num_hands, 1).exp()
+        self._start_s = protocol.settle_seconds
+
+    def reset(self, mask: torch.Tensor, rng: torch.Generator) -> None:
+        """Trials go on as they are."""
+
+    def at(self, time_s: torch.Tensor) -> torch.Tensor:
+        """Forces (N, H, 3) [N] at times (N,) [s]."""
+        since = (time_s - self._start_s)[:, None, None]
+        return (since > -1e-4) * torch.sin(self._rate * since) * self._amplitude
+
+
+def exchanged_energy(env: H1Env, protocol: Stability) -> torch.Tensor:
+    """Energy (T, N, H) that forces on the hands have put into the arms since their onset, at rest [J].
+
+    Nothing is stored at rest, so that a negative one has been drawn from the law. In the second half of the worlds the
+    stiffness changes.
+    """
+    rng = torch.Generator().manual_seed(protocol.seed)
+    env.motions.hold(random_poses(env.spec, env.num_envs, rng).flatten(1) * 0.5)
+    forces = SwingingForces(protocol, len(env.spec.arms), rng)
+    env.scripted = forces  # pyright: ignore[reportAttributeAccessIssue]
+    env.reset()
+    stiffness = env.upper_body.parameters.stiffness.clone()
+    changing = torch.arange(env.num_envs) >= env.num_envs // 2
+    hold = round(protocol.change_seconds / env.dt)
+    energy = torch.zeros(env.num_envs, len(env.spec.arms))
+    rows = []
+    action = torch.zeros(env.num_envs, env.num_actions)
+    settle = round(protocol.settle_seconds / env.dt)
+    for step in range(settle + round(protocol.seconds / env.dt)):
+        if step >= settle and (step - settle) % hold == 0:
+            draw = uniform(rng, -0.5, 0.5, *stiffness.shape)
+            changed = stiffness * protocol.change_factor**draw
+            env.upper_body.parameters.stiffness = torch.where(changing[:, None, None], changed, stiffness)
+        before, force = _hands(env), forces.at(env.dt * env.episode_length_buf)
+        _, _, _, extras = env.step(action)
+        # Where a world has diverged it has been restarted: it has given all that can be.
+        moved = torch.where(extras["falls"][:, None, None], torch.full_like(before, -math.inf), _hands(env) - before)
+        energy = energy + torch.nan_to_num((force * moved).sum(-1), nan=-math.inf, posinf=-math.inf)
+        if step >= settle:
+            rows.append(energy.clone())
+    return torch.stack(rows)
+
+
+def _hands(env: H1Env) -> torch.Tensor:
+    """(N, H, 3) relative to the torso, heading frame [m]."""
+    s = env.state
+    return s.arms.tip @ (s.heading_w.transpose(1, 2) @ s.torso_rotation_w).transpose(1, 2)
+
+
+def energy_summary(energy: torch.Tensor) -> dict[str, Any]:
+    """Least energy over time, per hand and trial: mean, least, and the share of trials that lack more than nothing."""
+    out = {}
+    half = energy.shape[1] // 2
+    for name, part in (("constant_stiffness", energy[:, :half]), ("changing_stiffness", energy[:, half:])):
+        least = part.amin(0).flatten()
+        finite = least[torch.isfinite(least)]
+        out[name] = {
+            "trials": least.numel(),
+            "mean_least_energy": float(finite.mean()) if finite.numel() else None,
+            "least_energy": float(finite.min()) if finite.numel() else None,
+            "share_drawn": float((least < -NOTHING_J).double().mean()),
+            "num_diverged": int((~torch.isfinite(least)).sum()),
+        }
+    return out
+
+
+def table(content: dict[str, Any]) -> str:
+    """Both parts as Markdown."""
+    lines = [
+        "| hand held by [N/m] | joint errors [rad] | largest real part [1/s] | poses unstable |",
+        "|---|---|---|---|",
+    ]
+    for row in content["linearised"]:
+        lines.append(
+            f"| {row['wall']:g} | {row['load_rad']:g} | {row['largest_real_part']:+.2f} | {row['share_unstable']:.1%} |"
+        )
+    lines += ["", "| stiffness | least energy, mean [J] | least of all [J] | trials drawn from |", "|---|---|---|---|"]
+    for name, row in content["energy"].items():
+        numbers = [f"{row[k]:.4f}" if row[k] is not None else "-" for k in ("mean_least_energy", "least_energy")]
+        lines.append(f"| {name.split('_')[0]} | {numbers[0]} | {numbers[1]} | {row['share_drawn']:.1%} |")
+    return "\n".join([*lines, "", f"stability, {content['method']}: {content['num_poses']} poses"])
