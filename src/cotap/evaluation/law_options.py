@@ -44,7 +44,8 @@ class LawOptions:
     def configure(self) -> UpperBodyConfig:
         """The config of the arms. Raises ValueError naming what is wrong."""
         own: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(LawConfig) if hasattr(self, f.name)}
-        common = LawConfig(self.method, **(own | {"stiffness": _three(self.stiffness)}))
+        own["stiffness"] = _three(self.stiffness)
+        common = LawConfig(self.method, **own)
         out = UpperBodyConfig(
             parse_law("left", self.left, common) if self.left else common,
             parse_law("right", self.right, common) if self.right else replace(common),
