@@ -12,6 +12,7 @@ from tensordict import TensorDict
 
 from cotap.checks import require_all_finite, require_one_of, require_positive_int, require_range, require_shape
 from cotap.compliance.kinematics import ChainPose
+from cotap.compliance.laws import LawConfig
 from cotap.envs.commands import CommandConfig, CommandSource, leaning
 from cotap.envs.disturbances import Assistance, AssistConfig, HandForceConfig, HandForces, assist_wrench
 from cotap.envs.forces import ForceProfile, ScriptedForces
@@ -349,6 +350,20 @@ class H1Env(VecEnv):
             lead = self.cfg.actions.reference_lead_s * reference.velocity
             target[:, upper] += reference.position + lead - self._default[upper]
         return target
+
+    def set_law(self, world: int, arm: int, law: LawConfig) -> None:
+        """Put one arm of one world under another law, from the next step on. Raises ValueError as `law.check` does."""
+        ruled = self.upper_body.active
+        self.upper_body.set_law(world, arm, law)
+        if ruled and not self.upper_body.active:  # actuators are the arms' own PD again
+            self.randomizer.write_gains(torch.ones(self.num_envs, dtype=torch.bool))
+            self._kp, self._kd = self.randomizer.gains()
+
+    def arm_stiffness(self) -> torch.Tensor:
+        """Joint stiffness of the arms under the laws in force, (N, A, n, n) [Nm/rad]."""
+        if self.upper_body.active:
+            return self.upper_body.stiffness
+        return torch.diag_embed(self.reader.arm_joints(self._kp))
 
     def state_dict(self) -> dict[str, Any]:
         """All that the environment's future depends on."""

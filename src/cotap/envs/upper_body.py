@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from cotap.checks import require_interval, require_one_of, require_range
-from cotap.compliance.laws import LAWS, Arms, ArmState, LawConfig, LawParameters, TorqueLaw
+from cotap.compliance.laws import LAWS, Arms, ArmState, LawConfig, LawParameters, TorqueLaw, UpperBodyLaw
 from cotap.compliance.torso import chain_compliance, hand_base_compliance, torso_compliance
 from cotap.envs.persistence import Stateful, uniform
 from cotap.envs.state import RobotState
@@ -94,23 +94,18 @@ class UpperBody(Stateful):
     def __init__(self, cfg: UpperBodyConfig, spec: RobotSpec, num_envs: int) -> None:
         cfg.check()
         self._cfg, self._spec = cfg, spec
-        chains = arm_chains(spec)
-        arms = Arms(chains, arm_inertias(spec), *arm_gains(spec))
+        self._arms = Arms(arm_chains(spec), arm_inertias(spec), *arm_gains(spec))
         configs = [cfg.of(arm.side) for arm in spec.arms]
-        self.active = any(c.name != "pd" for c in configs)
-        """Whether any arm is under a law that plain PD actuators do not implement by themselves."""
-        self._laws = []
-        for kind in dict.fromkeys((c.name, c.error, c.damping, c.soft_gain) for c in configs):
-            chosen = [(c.name, c.error, c.damping, c.soft_gain) == kind for c in configs]
-            law = LAWS[kind[0]](arms, next(c for c, mine in zip(configs, chosen, strict=True) if mine))
-            self._laws.append((law, torch.tensor(chosen)))
         n, a, j = num_envs, len(configs), len(spec.arms[0].joints)
+        self._shape = (n, a, j)
+        self._laws: dict[tuple[str, str, str, float], tuple[UpperBodyLaw, torch.Tensor]] = {}
+        for i, c in enumerate(configs):
+            self._mask(c)[:, i] = True
         self.parameters = LawParameters(
             torch.tensor([c.stiffness for c in configs]).repeat(n, 1, 1),
             torch.tensor([c.null_stiffness for c in configs]).repeat(n, 1),
             torch.tensor([c.alpha for c in configs]).repeat(n, 1),
         )
-        self._shape = (n, a, j)
         self.fresh = torch.ones(n, dtype=torch.bool)
         # Two torque laws, the one in force and the one before it: (2, N, A, n[, n]).
         self._anchor, self._feedforward, self._elastic = (torch.zeros(2, n, a, j) for _ in range(3))
@@ -119,6 +114,34 @@ class UpperBody(Stateful):
         self._torso = _TorsoModel(cfg.torso, spec)
         self.log: dict[str, torch.Tensor] = {}
         """Means over worlds and arms of what the laws report about the last step."""
+
+    def set_law(self, world: int, arm: int, law: LawConfig) -> None:
+        """Put one arm of one world under another law, or other parameters, from the next command on.
+
+        Raises:
+            ValueError: a field of `law` is out of its range.
+        """
+        law.check()
+        p = self.parameters
+        p.stiffness[world, arm] = torch.tensor(law.stiffness)
+        p.null_stiffness[world, arm], p.alpha[world, arm] = law.null_stiffness, law.alpha
+        if self._mask(law)[world, arm]:
+            return
+        for _, mine in self._laws.values():
+            mine[world, arm] = False
+        self._mask(law)[world, arm] = True
+        self._laws = {kind: pair for kind, pair in self._laws.items() if pair[1].any()}
+        self.fresh[world] = True
+
+    @property
+    def active(self) -> bool:
+        """Whether any arm is under a law that plain PD actuators do not implement by themselves."""
+        return any(kind[0] != "pd" for kind in self._laws)
+
+    @property
+    def stiffness(self) -> torch.Tensor:
+        """(N, A, n, n) joint stiffness that the newest command asks for [Nm/rad]; zero while not `active`."""
+        return self._stiffness[1]
 
     def reset(self, mask: torch.Tensor, rng: torch.Generator) -> None:
         """The next command of the worlds in `mask` has none before it; their parameters are drawn anew."""
@@ -207,21 +230,33 @@ class UpperBody(Stateful):
             self._damping[which],
         )
 
+    def _mask(self, law: LawConfig) -> torch.Tensor:
+        """The arms (N, A) under laws of one kind, to write to; none at first."""
+        kind = _kind(law)
+        if kind not in self._laws:
+            self._laws[kind] = (LAWS[law.name](self._arms, law), torch.zeros(self._shape[:2], dtype=torch.bool))
+        return self._laws[kind][1]
+
     def _ask(self, arms: ArmState) -> tuple[TorqueLaw, dict[str, torch.Tensor]]:
         """Every law for all arms; each arm keeps its own's answer."""
         merged: TorqueLaw | None = None
         log: dict[str, torch.Tensor] = {}
-        for law, mine in self._laws:
+        for law, mine in self._laws.values():
             answer, report = law(arms, self.parameters)
-            log.update({f"/law/{k}": v[:, mine].mean() for k, v in report.values.items()})
+            log.update({f"/law/{k}": v[mine].mean() for k, v in report.values.items()})
             merged = answer if merged is None else _choose(mine, answer, merged)
         assert merged is not None
         return merged, log
 
 
+def _kind(law: LawConfig) -> tuple[str, str, str, float]:
+    """What a law is made of; its other fields are parameters, which may differ between worlds."""
+    return law.name, law.error, law.damping, law.soft_gain
+
+
 def _choose(mine: torch.Tensor, answer: TorqueLaw, other: TorqueLaw) -> TorqueLaw:
-    """`answer` for the arms in `mine` (A,), `other` for the rest."""
-    vector, matrix = mine[None, :, None], mine[None, :, None, None]
+    """`answer` for the arms in `mine` (N, A), `other` for the rest."""
+    vector, matrix = mine[..., None], mine[..., None, None]
     return TorqueLaw(
         answer.anchor,
         torch.where(vector, answer.feedforward, other.feedforward),

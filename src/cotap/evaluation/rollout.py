@@ -74,12 +74,13 @@ def record_rollout(
             action = action.clone()
             action[:, env.action_slices["upper"]] = 0.0
         obs, _, _, extras = env.step(action)
-        for name, value in _row(env, extras["falls"]).items():
+        for name, value in trajectory_row(env, extras["falls"]).items():
             rows[name].append(value)
     return Trajectory(dt=env.dt, **{name: torch.stack(values) for name, values in rows.items()})
 
 
-def _row(env: H1Env, fell: torch.Tensor) -> dict[str, torch.Tensor]:
+def trajectory_row(env: H1Env, fell: torch.Tensor) -> dict[str, torch.Tensor]:
+    """One step's row (N, ...) of a `Trajectory`, just after `env.step`; `fell` (N,) from its extras."""
     r, upper = env.record, env.action_slices["upper"]
     s, hands = r.state, len(env.spec.arms)
     return {
