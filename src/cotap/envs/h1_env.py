@@ -270,6 +270,14 @@ class H1Env(VecEnv):
         self._observe(everyone)
         return self._observations
 
+    def reset_alike(self, seed: int) -> TensorDict:
+        """Restart every world with the same random numbers, so that all start in one state; return the observations."""
+        for world in range(self.num_envs):
+            self.rng.manual_seed(seed)
+            self._restart(torch.arange(self.num_envs) == world)
+        self._observe(torch.ones(self.num_envs, dtype=torch.bool))
+        return self._observations
+
     def get_observations(self) -> TensorDict:
         """The present observations: `policy` (N, 430), `privileged` (N, 13), and `clean` where sensors are noisy."""
         return self._observations
