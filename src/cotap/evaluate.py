@@ -19,6 +19,7 @@ from cotap.configs import from_plain, to_plain
 from cotap.evaluation.disturbance import ConstantLoad, Impact
 from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.protocols import VelocityTracking
+from cotap.evaluation.recording import RecordingProtocol
 from cotap.evaluation.static import StaticStiffness
 
 if TYPE_CHECKING:
@@ -69,6 +70,15 @@ class ConstantLoadOptions(CommonOptions):
     """A load on a hand, held: errors of hand, arm and torso, torques, falls."""
 
     protocol: tyro.conf.OmitArgPrefixes[ConstantLoad] = field(default_factory=ConstantLoad)
+
+
+@dataclass
+class RecordingOptions:
+    """A recording of `cotap.play`: the same measures, robot by robot."""
+
+    json: str = ""
+    """Write the result here."""
+    protocol: tyro.conf.OmitArgPrefixes[RecordingProtocol] = field(default_factory=RecordingProtocol)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -227,11 +237,32 @@ def disturbance(name: str, options: ImpactOptions | ConstantLoadOptions) -> dict
     return result
 
 
+def recording(options: RecordingOptions) -> dict[str, Any]:
+    """Measure a recording, print the table, write what was asked for, and return the result."""
+    from cotap.agents.checkpoint import write_json
+    from cotap.evaluation.recording import load_recording, measure
+    from cotap.evaluation.report import table
+
+    options.protocol.check()
+    _require_folder("json", options.json)
+    start = time.perf_counter()
+    loaded = load_recording(options.protocol.file)
+    result = {"protocol": "recording", "method": "as recorded", "settings": to_plain(options.protocol)}
+    result["settings"]["recorded"] = loaded.settings
+    result |= measure(loaded, options.protocol)
+    result["seconds"] = time.perf_counter() - start
+    print(table(result))
+    if options.json:
+        write_json(Path(options.json), result)
+    return result
+
+
 PROTOCOLS: dict[str, tuple[type[Any], Callable[[Any], dict[str, Any]]]] = {
     "velocity-tracking": (VelocityTrackingOptions, velocity_tracking),
     "static-stiffness": (StaticStiffnessOptions, static_stiffness),
     "impact": (ImpactOptions, partial(disturbance, "impact")),
     "constant-load": (ConstantLoadOptions, partial(disturbance, "constant-load")),
+    "recording": (RecordingOptions, recording),
 }
 """Every protocol's options and what runs it."""
 

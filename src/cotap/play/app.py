@@ -152,15 +152,16 @@ class App:
 
     def _add_tabs(self) -> None:
         gui = self.server.gui
-        with self.panel.tabs.add_tab("Plots"):
-            self._live_plots = gui.add_checkbox("live plots", True)
-            self.plots = Plots(self.server, self.session.sides, self.session.dt)
         with self.panel.tabs.add_tab("View"):
             self._add_view()
         with self.panel.tabs.add_tab("Record"):
             for label, on in (("Start recording", True), ("Stop and save", False)):
                 self.panel.button(label, Record(on))
             self.archive.add_buttons(gui, self.scene)
+        # Not in a tab: a plot that is made while it is hidden has no width.
+        with gui.add_folder("Plots") as folder:
+            self._live_plots = gui.add_checkbox("live", True)
+        self.plots = Plots(self.server, folder, self.session.sides, self.session.dt)
 
     def _add_view(self) -> None:
         gui, scene = self.server.gui, self.scene
@@ -175,7 +176,7 @@ class App:
             box.on_update(update)
         gui.add_markdown(
             "Green: where the reference has the hand. Orange ball: the hand; drag it. Red arrow: force on it. "
-            "Blue wires: the stiffness asked for; orange: the effective one (10 cm for 1000 N/m). "
+            "Blue wires: the stiffness asked for; orange: the effective one (30 cm for 1000 N/m). "
             f"Shapes: {scene.shapes}."
         )
 

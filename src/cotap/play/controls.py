@@ -115,13 +115,13 @@ class Ranges:
 def make_controls(r: Ranges) -> dict[str, Control]:
     """Every control by name: `velocity_x`, `held.left.z`, `a.left.stiffness_x`, ..."""
     controls: dict[str, Control] = {
-        "velocity_x": Number("forward velocity [m/s]", *r.velocity_x, 0.0, 0.05),
-        "velocity_y": Number("leftward velocity [m/s]", *r.velocity_y, 0.0, 0.05),
-        "yaw_rate": Number("turning rate [rad/s]", *r.yaw_rate, 0.0, 0.05),
-        "height_offset": Number("height against nominal, standing [m]", *r.height_offset, 0.0, 0.01),
+        "velocity_x": Number("forward [m/s]", *r.velocity_x, 0.0, 0.05),
+        "velocity_y": Number("leftward [m/s]", *r.velocity_y, 0.0, 0.05),
+        "yaw_rate": Number("turn [rad/s]", *r.yaw_rate, 0.0, 0.05),
+        "height_offset": Number("height [m]", *r.height_offset, 0.0, 0.01),
         "stand": Flag("stand", True),
         "motion": Choice("arm motion", r.motions, r.motions[0]),
-        "speed": Number("speed, 1 is real time", 0.1, 4.0, 1.0, 0.1),
+        "speed": Number("speed", 0.1, 4.0, 1.0, 0.1),
         "paused": Flag("paused", False),
         "side_by_side": Flag("side by side", False),
     }
@@ -131,8 +131,8 @@ def make_controls(r: Ranges) -> dict[str, Control]:
     for robot in ROBOTS:
         controls[f"{robot}.checkpoint"] = Choice("policy", r.checkpoints, r.checkpoints[0])
         controls[f"{robot}.friction"] = Number("friction", 0.2, 1.5, 1.0, 0.05)
-        controls[f"{robot}.mass_scale"] = Number("mass, share of nominal", 0.8, 1.3, 1.0, 0.01)
-        controls[f"{robot}.load_kg"] = Number("load on the pelvis [kg]", -1.0, 10.0, 0.0, 0.5)
+        controls[f"{robot}.mass_scale"] = Number("mass [nominal]", 0.8, 1.3, 1.0, 0.01)
+        controls[f"{robot}.load_kg"] = Number("pelvis load [kg]", -1.0, 10.0, 0.0, 0.5)
         for side in r.sides:
             controls |= {f"{robot}.{side}.{name}": c for name, c in _law_controls(r.laws).items()}
             controls[f"{robot}.{side}.drag"] = Point("drag", 1e3)

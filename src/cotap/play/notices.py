@@ -20,8 +20,8 @@ class Notices:
 
     def tell(self, text: str, client: viser.ClientHandle | None = None, title: str = "cotap") -> None:
         """Show `text` to `client`, or to every viewer."""
-        for viewer in [client] if client else self._server.get_clients().values():
-            if self._due(viewer.client_id):
+        for viewer in self._server.get_clients().values():
+            if client in (None, viewer) and self._due(viewer.client_id):
                 viewer.add_notification(title, text, auto_close_seconds=6.0)
 
     def _due(self, client_id: int) -> bool:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections import deque
+from contextlib import AbstractContextManager
+from typing import Any
 
 import numpy as np
 import viser
@@ -49,10 +51,11 @@ def force_displacement(samples: list[Sample], robot: int, hand: int) -> tuple[np
 
 
 class Plots:
-    """Five plots in the present container of the page.
+    """Five plots, made when there is something to plot.
 
     Args:
         server: The page.
+        container: The tab or folder that they are in.
         sides: Arms.
         dt: Control step [s].
     """
@@ -60,10 +63,12 @@ class Plots:
     TITLES = ("hand error [mm]", "arm torque [Nm]", "torso velocity [m/s]", "eigenvalues of K [Nm/rad]",
               "force [N] over displacement along it [mm]")  # fmt: skip
 
-    def __init__(self, server: viser.ViserServer, sides: tuple[str, ...], dt: float) -> None:
-        self._gui, self._sides, self._dt = server.gui, sides, dt
+    def __init__(
+        self, server: viser.ViserServer, container: AbstractContextManager[Any], sides: tuple[str, ...], dt: float
+    ) -> None:
+        self._gui, self._container, self._sides, self._dt = server.gui, container, sides, dt
         self._history: deque[tuple[int, Sample]] = deque(maxlen=round(SECONDS / dt / EVERY))
-        self._handles: list[viser.GuiUplotHandle] = []
+        self._sets: dict[int, list[viser.GuiUplotHandle]] = {}
         self._count = 0
 
     def append(self, step: int, sample: Sample) -> None:
@@ -82,9 +87,21 @@ class Plots:
             return
         lines = self._lines(history, count)
         if count != self._count:
-            self._build(lines, count)
-        for handle, points in zip(self._handles, lines, strict=True):
+            self._change(lines, count)
+            return
+        for handle, points in zip(self._sets[count], lines, strict=True):
             handle.data = points
+
+    def _change(self, lines: list[Points], count: int) -> None:
+        """Show the plots for this many robots. Those for other numbers are hidden, not removed: browsers may still
+        have an update of theirs to come."""
+        if count not in self._sets:
+            with self._container:
+                self._sets[count] = self._build(lines, count)
+        for number, handles in self._sets.items():
+            for handle in handles:
+                handle.visible = number == count
+        self._count = count
 
     def _lines(self, history: list[tuple[int, Sample]], count: int) -> list[Points]:
         samples = [s for _, s in history]
@@ -101,9 +118,7 @@ class Plots:
             _scatter([force_displacement(samples, *p) for p in pairs]),
         ]  # fmt: skip
 
-    def _build(self, lines: list[Points], count: int) -> None:
-        for handle in self._handles:
-            handle.remove()
+    def _build(self, lines: list[Points], count: int) -> list[viser.GuiUplotHandle]:
         pairs = [(r, side) for r in ROBOTS[:count] for side in self._sides]
         label = {(r, side): side if count == 1 else f"{r.upper()} {side}" for r, side in pairs}
         hands = [_line(label[p], COLORS[p]) for p in pairs]
@@ -113,7 +128,7 @@ class Plots:
         ]  # fmt: skip
         ends = [_line(f"{label[p]} {end}", COLORS[p], dash=end == "min") for p in pairs for end in ("min", "max")]
         dots = [_line(label[p], COLORS[p], dots=True) for p in pairs]
-        self._handles = [
+        return [
             self._gui.add_uplot(
                 points, (uplot.Series(label="t [s]" if i < 4 else "mm"), *series), title=title, height=190,
                 scales={"x": uplot.Scale(time=False)}, legend=uplot.Legend(live=False),
@@ -122,7 +137,6 @@ class Plots:
                 zip(self.TITLES, lines, (hands, hands, torso, ends, dots), strict=True)
             )
         ]  # fmt: skip
-        self._count = count
 
 
 def _line(label: str, color: str, dash: bool = False, dots: bool = False) -> uplot.Series:

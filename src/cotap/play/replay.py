@@ -59,7 +59,9 @@ class Replay:
         self._at = 0.0
         self._time.on_update(self._seek)
         archive.add_buttons(gui, self.scene)
-        self._plots = Plots(server, tuple(arm.side for arm in spec.arms), self._dt)
+        with gui.add_folder("Plots") as folder:
+            gui.add_markdown(f"The last {SECONDS:g} s before what is shown.")
+        self._plots = Plots(server, folder, tuple(arm.side for arm in spec.arms), self._dt)
 
     def run(self) -> None:
         """Show it until `stop`, or Ctrl-C."""

@@ -14,14 +14,16 @@ from cotap.robots import RobotSpec
 
 APART_M = 1.5
 """How far to its right the second robot is shown from where its own world has it [m]."""
-ELLIPSOID_M = 1e-4
-"""Half axis of an ellipsoid of stiffness per stiffness [m per N/m]: 10 cm for 1000 N/m."""
-ELLIPSOID_MAX_M = 0.3
+ELLIPSOID_M = 3e-4
+"""Half axis of an ellipsoid of stiffness per stiffness [m per N/m]: 30 cm for 1000 N/m."""
+ELLIPSOID_MAX_M = 0.5
 """Longest half axis: along a straight arm there is no end to the stiffness [m]."""
 ARROW_M = 0.004
 """Length of a force's arrow per force [m/N]."""
 ARROW_MAX_M = 1.5
 """Longest arrow [m]."""
+HAND_M, REFERENCE_M = 0.055, 0.04
+"""Radii of the balls at hands and at their references [m]."""
 HIDDEN = 1e-6
 """Scale of what is not there: sizes of batches stay as they are."""
 HAND, REFERENCE, FORCE, CONTACT = (230, 120, 40), (40, 170, 80), (200, 30, 50), (230, 153, 51)
@@ -47,9 +49,9 @@ class Scene:
         self._robots.camera_tracking_enabled = False
         self._add_surroundings()
         ball = trimesh.creation.icosphere(subdivisions=2)
-        self.hands = self._batch("hands", ball, HAND, 0.03)
+        self.hands = self._batch("hands", ball, HAND, HAND_M)
         """Balls at the hands, robot by robot, to be taken hold of."""
-        self._references = self._batch("references", ball, REFERENCE, 0.02)
+        self._references = self._batch("references", ball, REFERENCE, REFERENCE_M)
         self._effective = self._batch("effective", trimesh.creation.icosphere(subdivisions=3), EFFECTIVE, 0.0, 0.35)
         self._commanded = self._batch("commanded", ball, COMMANDED, 0.0, wireframe=True)
         self._arrows = server.scene.add_arrows(
@@ -85,13 +87,14 @@ class Scene:
 
     def _add_surroundings(self) -> None:
         scene = self._server.scene
+        scene.configure_environment_map(environment_intensity=0.25)
         self._floor = scene.add_frame("/floor", show_axes=False)
         scene.add_grid(
             "/floor/grid", infinite_grid=True, cell_size=0.5, section_size=1.0, fade_distance=25.0, plane_opacity=0.5,
             shadow_opacity=0.25,
         )  # fmt: skip
-        self._server.initial_camera.position = (2.2, 1.9, 1.5)
-        self._server.initial_camera.look_at = (0.0, 0.0, 0.85)
+        self._server.initial_camera.position = (2.9, 1.5, 1.5)
+        self._server.initial_camera.look_at = (0.0, 0.35, 0.8)  # the panel covers the right
 
     def _batch(
         self, name: str, mesh: trimesh.Trimesh, color: tuple[int, int, int], size: float, opacity: float | None = None,
@@ -115,7 +118,7 @@ class Scene:
         hands = (s["hand_w"] + place).reshape(-1, 3)
         self.hands.batched_positions = hands
         self._references.batched_positions = (s["hand_reference_w"] + place).reshape(-1, 3)
-        for handle, size in ((self.hands, 0.03), (self._references, 0.02)):
+        for handle, size in ((self.hands, HAND_M), (self._references, REFERENCE_M)):
             handle.batched_scales = np.repeat(size * visible, 3, 2).reshape(-1, 3)
         heading = np.repeat(s["heading_w"][:, None], self._hands, 1)
         commanded = np.nan_to_num(s["commanded_stiffness"], nan=0.0)
@@ -138,7 +141,8 @@ class Scene:
             tip = (s["hand_w"] + self._offset[:, None])[: self.shown].reshape(-1, 3)[on]
             length = np.minimum(ARROW_M * size[on] + 0.06, ARROW_MAX_M)
             # The arrow ends where it pushes.
-            self._arrows.points = np.stack((tip - force[on] / size[on, None] * length[:, None], tip), 1)
+            start = tip - force[on] / size[on, None] * length[:, None]
+            self._arrows.points = np.stack((start, tip), 1).astype(np.float32)
 
     def _show_contacts(self, contacts: list[np.ndarray]) -> None:
         points = [c + self._offset[i] for i, c in enumerate(contacts[: self.shown])]
