@@ -77,5 +77,5 @@ def test_arms_are_led_into_a_clip_and_back_without_a_jump(make_env):
 
 
 def test_an_unknown_motion_is_refused_with_those_known(make_env):
-    with pytest.raises(ValueError, match="known: .*rest"):
+    with pytest.raises(ValueError, match=r"known: .*rest"):
         make_env(num_envs=1).motions.lead("moonwalk")

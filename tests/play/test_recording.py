@@ -13,8 +13,9 @@ from cotap.play.forces import Push
 from cotap.play.recorder import Recorder, samples_of
 
 
-@pytest.fixture
-def recording(session):
+@pytest.fixture(scope="module")
+def recording(shared_session):
+    session = shared_session
     recorder = Recorder(session.dt, 2, session.describe())
     session.set({"b.left.law": "pd"})
     for step in range(90):

@@ -42,22 +42,22 @@ def test_law_and_stiffness_are_set_per_robot_and_arm(session):
 
 
 def test_the_softer_robot_gives_way_further_to_the_same_load(session):
-    session.set({f"b.left.stiffness_{axis}": 900.0 for axis in "xyz"} | {"held.left.z": -12.0})
+    session.set({f"b.left.stiffness_{axis}": 900.0 for axis in "xyz"} | {"arm_actions": False, "held.left.z": -12.0})
     samples = run(session, 100)
     offset = np.array([s["hand_w"][:, LEFT, 2] - s["hand_reference_w"][:, LEFT, 2] for s in samples])[-25:].mean(0)
     force = samples[-1]["hand_force_w"][:, LEFT]
     np.testing.assert_allclose(force, [[0.0, 0.0, -12.0]] * 2, atol=1e-5)
-    # Relative to the torso: -12 N over 300 and over 900 N/m, beside the tracking error that is there without a load.
+    # -12 N over 300 and over 900 N/m; what else is off is the same for both.
     assert offset[0] - offset[1] == pytest.approx(-12.0 / 300.0 + 12.0 / 900.0, abs=0.006)
 
 
 def test_commands_reach_the_robots_and_standing_keeps_them_on_the_spot(session):
     session.set({"velocity_x": 0.6, "stand": False, "yaw_rate": -0.3})
-    samples = run(session, 150)
+    samples = run(session, 120)
     assert samples[-1]["command"][0].tolist() == pytest.approx([0.6, 0.0, -0.3])
     assert np.mean([s["velocity"][0, 0] for s in samples[-50:]]) > 0.35
     session.set({"stand": True})
-    run(session, 100)
+    run(session, 30)
     assert session.env.commands.told_to_stand.all()
     assert session.env.commands.current().velocity_h.abs().max() == 0.0
 
@@ -80,7 +80,7 @@ def test_domain_is_set_per_robot(session):
     assert torch.allclose(mass[0], nominal)
     assert float(mass[1].sum()) == pytest.approx(1.2 * float(nominal.sum()) + 5.0, rel=1e-6)
     sliding = session.env.sim.field("geom_friction")[:, :, 0]
-    assert (sliding[0] == 0.4).sum() == (sliding[0] != sliding[1]).sum() > 0
+    assert torch.isclose(sliding[0], torch.tensor(0.4).double()).sum() == (sliding[0] != sliding[1]).sum() > 0
 
 
 def test_a_checkpoint_that_cannot_be_used_is_put_back_and_told(session):

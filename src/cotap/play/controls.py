@@ -121,6 +121,7 @@ def make_controls(r: Ranges) -> dict[str, Control]:
         "height_offset": Number("height [m]", *r.height_offset, 0.0, 0.01),
         "stand": Flag("stand", True),
         "motion": Choice("arm motion", r.motions, r.motions[0]),
+        "arm_actions": Flag("policy moves arms", True),
         "speed": Number("speed", 0.1, 4.0, 1.0, 0.1),
         "paused": Flag("paused", False),
         "side_by_side": Flag("side by side", False),

@@ -121,7 +121,7 @@ class Panel:
             self.bind("side_by_side")
 
     def _add_walk(self) -> None:
-        for name in ("stand", "velocity_x", "velocity_y", "yaw_rate", "height_offset", "motion"):
+        for name in ("stand", "velocity_x", "velocity_y", "yaw_rate", "height_offset", "motion", "arm_actions"):
             self.bind(name)
 
     def _add_arms(self, robot: str) -> None:

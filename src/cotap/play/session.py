@@ -127,6 +127,9 @@ class Session:
         actions = self._policies[0](observations)
         if self._policies[1] is not self._policies[0]:
             actions = torch.cat((actions[:1], self._policies[1](observations)[1:]))
+        if not self.values["arm_actions"]:
+            actions = actions.clone()
+            actions[:, self.env.action_slices["upper"]] = 0.0
         return actions
 
     def _policy(self, name: str) -> Policy:
