@@ -35,6 +35,17 @@ def test_mail_reaches_the_simulation_and_bad_mail_does_not(app):
     assert stiffness.tolist() == [700.0, 1500.0]
 
 
+def test_the_page_shows_what_was_accepted_not_what_was_sent(app):
+    alpha = app.panel._handles["a.left.alpha"]
+    for sent, shown in ((0.25, 0.25), (float("nan"), 0.25), (7.0, 1.0)):
+        alpha._impl.value = sent  # as a browser's message does
+        app.panel._set("a.left.alpha", sent, None)
+        if sent != shown:
+            assert alpha.value == shown
+    app.advance()
+    assert float(app.session.env.upper_body.parameters.alpha[0, 0]) == 1.0
+
+
 def test_paused_it_stands_still_but_for_single_steps_and_reset_starts_over(app):
     app.advance()
     app.mailbox.set("paused", True)

@@ -73,7 +73,7 @@ def page(free_port: int, tmp_path: Path) -> Iterator[Page]:
     thread.start()
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=BROWSER, args=ARGUMENTS)
-        page = browser.new_page(viewport={"width": 1280, "height": 1000})
+        page = browser.new_context(viewport={"width": 1280, "height": 1000}).new_page()
         complaints: list[str] = []
         page.on("console", lambda m: complaints.append(m.text) if m.type == "error" else None)
         page.on("pageerror", lambda e: complaints.append(str(e)))
@@ -100,7 +100,7 @@ def test_a_walk_through_the_page(page: Page, tmp_path: Path):
     page.number("K_ee z [N/m]", 99999, nth=1)  # the page's box clamps it, or the mailbox does
     page.until("stiffness of the right arm", lambda: float(parameters.stiffness[0, 1, 2]) == 1500.0)
 
-    page.page.get_by_text("law", exact=True).nth(0).locator("xpath=ancestor::*[.//input][1]").locator("input").click()
+    page.page.get_by_role("combobox", name="law").first.click()
     page.page.get_by_role("option", name="pd", exact=True).click()
     page.until("law of the left arm", lambda: session.values["a.left.law"] == "pd")
     assert session.values["a.right.law"] == "cotap"

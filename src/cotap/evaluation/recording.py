@@ -49,11 +49,11 @@ class Recording:
         """Write to `path` (.npz), whole or not at all."""
         arrays = {f"trajectory.{f.name}": getattr(self.trajectory, f.name) for f in fields(Trajectory)}
         arrays |= {f"scene.{name}": value for name, value in self.scene.items()}
-        head = json.dumps({"format": FORMAT, "version": VERSION, "settings": self.settings})
+        arrays["head"] = json.dumps({"format": FORMAT, "version": VERSION, "settings": self.settings})
 
         def write(temporary: Path) -> None:
             with temporary.open("wb") as file:
-                np.savez_compressed(file, head=np.array(head), **{k: np.asarray(v) for k, v in arrays.items()})
+                np.savez_compressed(file, allow_pickle=False, **{k: np.asarray(v) for k, v in arrays.items()})
 
         write_atomically(path, write)
 

@@ -115,11 +115,11 @@ class Scene:
 
     def _show_hands(self, s: Sample) -> None:
         place, visible = self._offset[:, None], self._visible()
-        hands = (s["hand_w"] + place).reshape(-1, 3)
+        hands = _batched(s["hand_w"] + place)
         self.hands.batched_positions = hands
-        self._references.batched_positions = (s["hand_reference_w"] + place).reshape(-1, 3)
+        self._references.batched_positions = _batched(s["hand_reference_w"] + place)
         for handle, size in ((self.hands, HAND_M), (self._references, REFERENCE_M)):
-            handle.batched_scales = np.repeat(size * visible, 3, 2).reshape(-1, 3)
+            handle.batched_scales = _batched(np.repeat(size * visible, 3, 2))
         heading = np.repeat(s["heading_w"][:, None], self._hands, 1)
         commanded = np.nan_to_num(s["commanded_stiffness"], nan=0.0)
         values, axes = np.linalg.eigh(s["effective_stiffness"])
@@ -129,8 +129,9 @@ class Scene:
         ):  # fmt: skip
             size = np.clip(ELLIPSOID_M * stiffness, HIDDEN, ELLIPSOID_MAX_M) * (visible if self.ellipsoids else HIDDEN)
             handle.batched_positions = hands
-            handle.batched_wxyzs = tf.SO3.from_matrix(rotation.reshape(-1, 3, 3).astype(np.float64)).wxyz
-            handle.batched_scales = np.maximum(size, HIDDEN).reshape(-1, 3)
+            turn = tf.SO3.from_matrix(rotation.reshape(-1, 3, 3).astype(np.float64))
+            handle.batched_wxyzs = turn.wxyz.astype(np.float32)
+            handle.batched_scales = _batched(np.maximum(size, HIDDEN))
 
     def _show_forces(self, s: Sample) -> None:
         force = s["hand_force_w"][: self.shown].reshape(-1, 3)
@@ -150,3 +151,8 @@ class Scene:
         self._contact_points.visible = bool(len(points)) and self.contacts
         if len(points):
             self._contact_points.points = points.astype(np.float32)
+
+
+def _batched(values: np.ndarray) -> np.ndarray:
+    """(W, H, 3) as browsers take it, (W H, 3)."""
+    return values.reshape(-1, 3).astype(np.float32)
