@@ -24,6 +24,7 @@ from cotap.evaluation.modulation import Modulation
 from cotap.evaluation.periodic import PeriodicLoad
 from cotap.evaluation.protocols import VelocityTracking
 from cotap.evaluation.punches import PunchWalk
+from cotap.evaluation.recording import RecordingProtocol
 from cotap.evaluation.scenario import Scenario
 from cotap.evaluation.stability import Stability
 from cotap.evaluation.static import StaticStiffness
@@ -140,6 +141,15 @@ class StabilityOptions(CommonOptions):
     """Linearised closed loop of an arm's law over random poses, and the energy that can be drawn from it."""
 
     protocol: tyro.conf.OmitArgPrefixes[Stability] = field(default_factory=Stability)
+
+
+@dataclass
+class RecordingOptions:
+    """A recording of `cotap.play`: the same measures, robot by robot."""
+
+    json: str = ""
+    """Write the result here."""
+    protocol: tyro.conf.OmitArgPrefixes[RecordingProtocol] = field(default_factory=RecordingProtocol)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -402,6 +412,26 @@ def stability(options: StabilityOptions) -> dict[str, Any]:
     return result
 
 
+def recording(options: RecordingOptions) -> dict[str, Any]:
+    """Measure a recording, print the table, write what was asked for, and return the result."""
+    from cotap.agents.checkpoint import write_json
+    from cotap.evaluation.recording import load_recording, measure
+    from cotap.evaluation.report import table
+
+    options.protocol.check()
+    _require_folder("json", options.json)
+    start = time.perf_counter()
+    loaded = load_recording(options.protocol.file)
+    result = {"protocol": "recording", "method": "as recorded", "settings": to_plain(options.protocol)}
+    result["settings"]["recorded"] = loaded.settings
+    result |= measure(loaded, options.protocol)
+    result["seconds"] = time.perf_counter() - start
+    print(table(result))
+    if options.json:
+        write_json(Path(options.json), result)
+    return result
+
+
 PROTOCOLS: dict[str, tuple[type[Any], Callable[[Any], dict[str, Any]]]] = {
     "velocity-tracking": (VelocityTrackingOptions, velocity_tracking),
     "static-stiffness": (StaticStiffnessOptions, static_stiffness),
@@ -413,6 +443,7 @@ PROTOCOLS: dict[str, tuple[type[Any], Callable[[Any], dict[str, Any]]]] = {
     "punches": (PunchesOptions, partial(scenario, "punches")),
     "fall-curve": (FallCurveOptions, partial(scenario, "fall-curve")),
     "modulation": (ModulationOptions, partial(scenario, "modulation")),
+    "recording": (RecordingOptions, recording),
 }
 """Every protocol's options and what runs it."""
 

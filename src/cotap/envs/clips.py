@@ -39,6 +39,11 @@ class ClipPlayer(Stateful):
         self.clip[mask] = clip
         self._frame[mask] = torch.rand(n, generator=rng) * self._last[clip]
 
+    def start(self, mask: torch.Tensor, clip: int) -> None:
+        """Begin clip number `clip` in the worlds of `mask`."""
+        self.clip[mask] = clip
+        self._frame[mask] = 0.0
+
     def step(self) -> torch.Tensor:
         """Advance by one control step. Returns the worlds (N,) whose clip began again."""
         frame, last = self._frame + self._advance, self._last[self.clip]

@@ -12,6 +12,7 @@ from tensordict import TensorDict
 
 from cotap.checks import require_all_finite, require_one_of, require_positive_int, require_range, require_shape
 from cotap.compliance.kinematics import ChainPose
+from cotap.compliance.laws import LawConfig
 from cotap.envs.blows import BlowConfig, Blows
 from cotap.envs.commands import CommandConfig, CommandSource, leaning
 from cotap.envs.disturbances import Assistance, AssistConfig, HandForceConfig, HandForces, assist_wrench
@@ -291,6 +292,14 @@ class H1Env(VecEnv):
         self._observe(everyone)
         return self._observations
 
+    def reset_alike(self, seed: int) -> TensorDict:
+        """Restart every world with the same random numbers, so that all start in one state; return the observations."""
+        for world in range(self.num_envs):
+            self.rng.manual_seed(seed)
+            self._restart(torch.arange(self.num_envs) == world)
+        self._observe(torch.ones(self.num_envs, dtype=torch.bool))
+        return self._observations
+
     def get_observations(self) -> TensorDict:
         """The present observations: `policy` (N, 430), `privileged` (N, 13), and `clean` where sensors are noisy."""
         return self._observations
@@ -376,6 +385,20 @@ class H1Env(VecEnv):
             lead = self.cfg.actions.reference_lead_s * reference.velocity
             target[:, upper] += reference.position + lead - self._default[upper]
         return target
+
+    def set_law(self, world: int, arm: int, law: LawConfig) -> None:
+        """Put one arm of one world under another law, from the next step on. Raises ValueError as `law.check` does."""
+        ruled = self.upper_body.active
+        self.upper_body.set_law(world, arm, law)
+        if ruled and not self.upper_body.active:  # actuators are the arms' own PD again
+            self.randomizer.write_gains(torch.ones(self.num_envs, dtype=torch.bool))
+            self._kp, self._kd = self.randomizer.gains()
+
+    def arm_stiffness(self) -> torch.Tensor:
+        """Joint stiffness of the arms under the laws in force, (N, A, n, n) [Nm/rad]."""
+        if self.upper_body.active:
+            return self.upper_body.stiffness
+        return torch.diag_embed(self.reader.arm_joints(self._kp))
 
     def state_dict(self) -> dict[str, Any]:
         """All that the environment's future depends on."""

@@ -65,13 +65,17 @@ class Randomizer(Stateful):
         cfg = self.cfg
         if not cfg.enabled:
             return
+        n, bodies = self._sim.field("body_mass").shape
+        scale = uniform(rng, *cfg.link_mass_scale, n, bodies)
+        self.set_mass(scale, uniform(rng, *cfg.base_mass_kg, n))
+
+    def set_mass(self, scale: torch.Tensor, added_kg: torch.Tensor) -> None:
+        """Give every world's links their nominal mass and inertia times `scale` (N, bodies), the base more (N,)."""
         mass, inertia = self._sim.field("body_mass"), self._sim.field("body_inertia")
-        n, bodies = mass.shape
-        scale = uniform(rng, *cfg.link_mass_scale, n, bodies).double()
         nominal = torch.from_numpy(self._sim.model.body_mass)
-        scaled = nominal * scale
+        scaled = nominal * scale.double()
         # Mass added to the base is spread as the base's own.
-        scaled[:, self._base] += uniform(rng, *cfg.base_mass_kg, n).double()
+        scaled[:, self._base] += added_kg.double()
         ratio = torch.where(nominal > 0.0, scaled / nominal.clamp_min(1e-12), torch.ones_like(scaled))
         mass.copy_(scaled)
         inertia.copy_(torch.from_numpy(self._sim.model.body_inertia) * ratio.unsqueeze(-1))
@@ -83,14 +87,17 @@ class Randomizer(Stateful):
         if n == 0 or not cfg.enabled:
             return
         joints = self.kp_scale.shape[1]
-        friction = self._sim.field("geom_friction")
-        sliding = uniform(rng, *cfg.friction, n).double()
-        for geom in self._foot_geoms:
-            friction[mask, geom, 0] = sliding
+        self.set_friction(mask, uniform(rng, *cfg.friction, n))
         self.kp_scale[mask] = uniform(rng, *cfg.kp_scale, n, joints)
         self.kd_scale[mask] = uniform(rng, *cfg.kd_scale, n, joints)
         delay_s[mask] = uniform(rng, *cfg.delay_s, n)
         self.write_gains(mask)
+
+    def set_friction(self, mask: torch.Tensor, sliding: torch.Tensor) -> None:
+        """Give the feet in the worlds of `mask` (N,) the sliding friction `sliding` (n,)."""
+        friction = self._sim.field("geom_friction")
+        for geom in self._foot_geoms:
+            friction[mask, geom, 0] = sliding.double()
 
     def write_gains(self, mask: torch.Tensor) -> None:
         """Bring the actuators' gains of the worlds in `mask` in line with the scales."""

@@ -9,13 +9,16 @@ from typing import Any
 import numpy as np
 import torch
 
-from cotap.checks import require_interval, require_range
+from cotap.checks import require_interval, require_one_of, require_range
 from cotap.envs.clips import ClipPlayer
 from cotap.envs.motions import PEAK_SPEED, ArmReference, MotionConfig, MotionGenerator, minimum_jerk
 from cotap.envs.persistence import Stateful, uniform
 from cotap.motions.library import MotionError, MotionLibrary, shipped_library
 from cotap.motions.pace import pace
 from cotap.robots import RobotSpec
+
+REST = "rest"
+"""The name of the motion that is none: the default pose."""
 
 
 @dataclass
@@ -109,6 +112,19 @@ class ReferenceMotion(Stateful):
         self._position = self.default.repeat(n, 1)
         self._velocity = torch.zeros(n, len(joints))
         self._fixed = False
+        self._led: str | None = None
+
+    def lead(self, motion: str) -> None:
+        """Take all worlds from where their arms are into `motion`, until further notice: a clip's name, from its
+        beginning and over again, or `REST`, the default pose.
+
+        Raises:
+            ValueError: no clip is called so, or clips are switched off.
+        """
+        self._led = require_one_of("motion", motion, (REST, *(self.clips.names if self.clips else ())))
+        everyone = torch.ones_like(self._from_clip)
+        self._begin(everyone, motion)
+        self._blend(everyone, self._raw().position)
 
     def hold(self, pose: torch.Tensor) -> None:
         """Hold `pose` (U,) or (N, U) in all worlds until further notice."""
@@ -165,15 +181,27 @@ class ReferenceMotion(Stateful):
             self.clips.clip.clamp_(max=len(self.clips.names) - 1)
 
     def _draw(self, mask: torch.Tensor, rng: torch.Generator) -> None:
+        if self._led is not None:
+            self._begin(mask, self._led)
+            return
         n = int(mask.sum())
         self._remaining_s[mask] = uniform(rng, *self.cfg.hold_s, n)
         if self.clips:
             self._from_clip[mask] = torch.rand(n, generator=rng) < self.cfg.share
             self.clips.draw(mask, rng)
 
+    def _begin(self, mask: torch.Tensor, motion: str) -> None:
+        """Start the clip called `motion`, or none, in the worlds of `mask`."""
+        self._remaining_s[mask] = math.inf
+        self._from_clip[mask] = motion != REST
+        if self.clips and motion != REST:
+            self.clips.start(mask, self.clips.names.index(motion))
+
     def _raw(self) -> ArmReference:
         """What generator or clip ask for, transitions aside."""
         generated = self.generator.current()
+        if self._led == REST:
+            return ArmReference(self.default.expand_as(generated.position), torch.zeros_like(generated.velocity))
         if self.clips is None:
             return generated
         chosen = self._from_clip.unsqueeze(1)
@@ -188,7 +216,7 @@ class ReferenceMotion(Stateful):
         self.generator.step(rng)
         self._remaining_s = self._remaining_s - self._dt
         if self.clips is None:
-            return self.generator.current().position
+            return self._raw().position
         changed = self.clips.step() & self._from_clip
         due = self._remaining_s <= 0.0
         if due.any():
@@ -196,9 +224,13 @@ class ReferenceMotion(Stateful):
             changed = changed | due
         raw = self._raw().position
         if changed.any():
-            offset = self._position - raw
-            fade = (PEAK_SPEED * (offset.abs() / self._blend_speed).amax(1)).clamp_min(self.cfg.blend_s)
-            self._offset = torch.where(changed.unsqueeze(1), offset, self._offset)
-            self._fade_s = torch.where(changed, fade, self._fade_s)
-            self._since_s = torch.where(changed, torch.zeros_like(fade), self._since_s)
+            self._blend(changed, raw)
         return raw
+
+    def _blend(self, changed: torch.Tensor, raw: torch.Tensor) -> None:
+        """Carry what the worlds of `changed` (N,) are off from `raw` (N, U) over into their new motion."""
+        offset = self._position - raw
+        fade = (PEAK_SPEED * (offset.abs() / self._blend_speed).amax(1)).clamp_min(self.cfg.blend_s)
+        self._offset = torch.where(changed.unsqueeze(1), offset, self._offset)
+        self._fade_s = torch.where(changed, fade, self._fade_s)
+        self._since_s = torch.where(changed, torch.zeros_like(fade), self._since_s)

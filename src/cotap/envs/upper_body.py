@@ -10,7 +10,7 @@ import torch
 
 from cotap.checks import require_interval, require_one_of, require_range
 from cotap.compliance import singularity_aware_ratio
-from cotap.compliance.interface import ArmState, LawParameters, Remembering, TorqueLaw
+from cotap.compliance.interface import ArmState, LawParameters, Remembering, TorqueLaw, UpperBodyLaw
 from cotap.compliance.laws import LAWS, LawConfig
 from cotap.compliance.torso import chain_compliance, hand_base_compliance, torso_compliance
 from cotap.envs.hand_sensing import HandSensors
@@ -102,24 +102,19 @@ class UpperBody(Stateful):
     def __init__(self, cfg: UpperBodyConfig, spec: RobotSpec, num_envs: int, dt: float) -> None:
         cfg.check()
         self._cfg, self._spec, self._dt = cfg, spec, dt
-        arms = arm_model(spec)
-        self._chains = arms.chains
+        self.arms = arm_model(spec)
         configs = [cfg.of(arm.side) for arm in spec.arms]
-        self.active = any(c.name != "pd" for c in configs)
-        """Whether any arm is under a law that plain PD actuators do not implement by themselves."""
-        self._laws = []
-        for kind in dict.fromkeys(c.kind() for c in configs):
-            chosen = [c.kind() == kind for c in configs]
-            law = next(c for c, mine in zip(configs, chosen, strict=True) if mine)
-            self._laws.append((LAWS[law.name](arms, law), law.sensing, torch.tensor(chosen)))
-        self.sensors = HandSensors(arms, num_envs, dt, any(c.sensing == "estimated" for c in configs))
+        self.sensors = HandSensors(self.arms, num_envs, dt, any(c.sensing == "estimated" for c in configs))
         n, a, j = num_envs, len(configs), len(spec.arms[0].joints)
+        self._shape = (n, a, j)
+        self._laws: dict[tuple[object, ...], tuple[UpperBodyLaw, LawConfig, torch.Tensor]] = {}
+        for i, c in enumerate(configs):
+            self._mask(c)[:, i] = True
         self.parameters = LawParameters(
             torch.tensor([c.stiffness for c in configs]).repeat(n, 1, 1),
             torch.tensor([c.null_stiffness for c in configs]).repeat(n, 1),
             torch.tensor([c.alpha for c in configs]).repeat(n, 1),
         )
-        self._shape = (n, a, j)
         self.fresh = torch.ones(n, dtype=torch.bool)
         # Two torque laws, the one in force and the one before it: (2, N, A, n[, n]).
         self._anchor, self._feedforward, self._elastic = (torch.zeros(2, n, a, j) for _ in range(3))
@@ -128,6 +123,35 @@ class UpperBody(Stateful):
         self._torso = _TorsoModel(cfg.torso, spec)
         self.log: dict[str, torch.Tensor] = {}
         """Means over worlds and arms of what the laws report about the last step."""
+
+    def set_law(self, world: int, arm: int, law: LawConfig) -> None:
+        """Put one arm of one world under another law, or other parameters, from the next command on.
+
+        Raises:
+            ValueError: a field of `law` is out of its range.
+        """
+        law.check()
+        p = self.parameters
+        p.stiffness[world, arm] = torch.tensor(law.stiffness)
+        p.null_stiffness[world, arm], p.alpha[world, arm] = law.null_stiffness, law.alpha
+        if self._mask(law)[world, arm]:
+            return
+        for _, _, mine in self._laws.values():
+            mine[world, arm] = False
+        self._mask(law)[world, arm] = True
+        self._laws = {kind: driven for kind, driven in self._laws.items() if driven[2].any()}
+        self.sensors.estimates = any(config.sensing == "estimated" for _, config, _ in self._laws.values())
+        self.fresh[world] = True
+
+    @property
+    def active(self) -> bool:
+        """Whether any arm is under a law that plain PD actuators do not implement by themselves."""
+        return any(config.name != "pd" for _, config, _ in self._laws.values())
+
+    @property
+    def stiffness(self) -> torch.Tensor:
+        """(N, A, n, n) joint stiffness that the newest command asks for [Nm/rad]; zero while not `active`."""
+        return self._stiffness[1]
 
     def reset(self, mask: torch.Tensor, rng: torch.Generator) -> None:
         """The next command of the worlds in `mask` has none before it; their parameters are drawn anew."""
@@ -229,7 +253,7 @@ class UpperBody(Stateful):
         super().load_state_dict(own)
 
     def _remembering(self) -> list[Remembering]:
-        return [law for law, *_ in self._laws if isinstance(law, Remembering)]
+        return [law for law, *_ in self._laws.values() if isinstance(law, Remembering)]
 
     def _upper(self, joints: torch.Tensor) -> torch.Tensor:
         return joints[:, len(self._spec.lower_joints) :]
@@ -246,26 +270,34 @@ class UpperBody(Stateful):
     def _undiminished(self, arms: ArmState) -> LawParameters:
         """The parameters, alpha raised by what the laws will take off it for a singularity."""
         one = torch.ones_like(self.parameters.alpha, dtype=torch.float64)
-        left = singularity_aware_ratio(one, self._chains.jacobian(arms.pose).double())
+        left = singularity_aware_ratio(one, self.arms.chains.jacobian(arms.pose).double())
         return replace(self.parameters, alpha=(self.parameters.alpha / left).float())
+
+    def _mask(self, law: LawConfig) -> torch.Tensor:
+        """The arms (N, A) under laws of one kind, to write to; none at first."""
+        kind = law.kind()
+        if kind not in self._laws:
+            nobody = torch.zeros(self._shape[:2], dtype=torch.bool)
+            self._laws[kind] = (LAWS[law.name](self.arms, law), law, nobody)
+        return self._laws[kind][2]
 
     def _ask(self, arms: ArmState) -> tuple[TorqueLaw, dict[str, torch.Tensor]]:
         """Every law for all arms; each arm keeps its own's answer."""
         merged: TorqueLaw | None = None
         log: dict[str, torch.Tensor] = {}
         parameters = self.parameters if self._cfg.singularity_ratio else self._undiminished(arms)
-        for law, sensing, mine in self._laws:
-            force = self.sensors.estimated if sensing == "estimated" else self.sensors.privileged
+        for law, config, mine in self._laws.values():
+            force = self.sensors.estimated if config.sensing == "estimated" else self.sensors.privileged
             answer, report = law(replace(arms, hand_force_h=force), parameters)
-            log.update({f"/law/{k}": v[:, mine].mean() for k, v in report.values.items()})
+            log.update({f"/law/{k}": v[mine].mean() for k, v in report.values.items()})
             merged = answer if merged is None else _choose(mine, answer, merged)
         assert merged is not None
         return merged, log
 
 
 def _choose(mine: torch.Tensor, answer: TorqueLaw, other: TorqueLaw) -> TorqueLaw:
-    """`answer` for the arms in `mine` (A,), `other` for the rest."""
-    vector, matrix = mine[None, :, None], mine[None, :, None, None]
+    """`answer` for the arms in `mine` (N, A), `other` for the rest."""
+    vector, matrix = mine[..., None], mine[..., None, None]
     return TorqueLaw(
         answer.anchor,
         torch.where(vector, answer.feedforward, other.feedforward),

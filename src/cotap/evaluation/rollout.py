@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 
 import torch
 from tqdm import tqdm
@@ -12,7 +12,6 @@ from tqdm import tqdm
 from cotap.agents.actors import as_dict
 from cotap.compliance.dynamics import gravity_torque
 from cotap.envs import H1Env
-from cotap.robots.chains import arm_inertias
 from cotap.rotations import rotate_inverse
 
 PolicyFunction = Callable[[dict[str, torch.Tensor]], torch.Tensor]
@@ -61,13 +60,17 @@ class Trajectory:
     """(T, N) horizontal distance of the torso from where its path has it [m]; NaN in worlds that follow none."""
     fell: torch.Tensor
     """(T, N) bool: the world fell in that step."""
-    film: torch.Tensor
+    film: torch.Tensor = field(default_factory=lambda: torch.zeros(0, 0))
     """(F, nq + 6 H) the first world's configuration, its hands' references and the force on each hand, world frame;
     F = T if it was filmed, else 0."""
 
     def alive(self) -> torch.Tensor:
         """(T, N) bool: the world has not fallen up to and including this step."""
         return self.fell.cumsum(0) == 0
+
+
+STEPPED = tuple(f.name for f in fields(Trajectory) if f.name not in ("dt", "film"))
+"""What a trajectory has of every step and world."""
 
 
 def record_rollout(
@@ -86,7 +89,6 @@ def record_rollout(
         film: Whether to record what pictures of the first world need.
     """
     obs = env.reset()
-    gravity = ArmStatics(env)
     record: dict[str, torch.Tensor] = {}
     frames: list[torch.Tensor] = []
     for step in tqdm(range(steps), desc="rollout", unit="step", disable=not progress, leave=False):
@@ -97,7 +99,7 @@ def record_rollout(
             action = action.clone()
             action[:, env.action_slices["upper"]] = 0.0
         obs, _, _, extras = env.step(action)
-        for name, value in (_row(env, extras["falls"]) | {"arm_static_torque": gravity(env)}).items():
+        for name, value in trajectory_row(env, extras["falls"]).items():
             record.setdefault(name, value.new_empty((steps, *value.shape)))[step] = value
         if film:
             frames.append(_frame(env))
@@ -116,21 +118,16 @@ def idle(env: H1Env) -> PolicyFunction:
     return lambda _: torch.zeros(env.num_envs, env.num_actions)
 
 
-class ArmStatics:
-    """The torque that holds the arms of an environment's robot still under gravity and the force at each hand."""
-
-    def __init__(self, env: H1Env) -> None:
-        self._inertias = arm_inertias(env.spec)
-
-    def __call__(self, env: H1Env) -> torch.Tensor:
-        """(N, U) [Nm], after a step, for the force that acted in it."""
-        s = env.record.state
-        held = gravity_torque(self._inertias, s.arms, s.torso_rotation_w[:, 2])
-        force_t = rotate_inverse(s.torso_rotation_w.unsqueeze(1), env.hand_force_w)
-        return (held - rotate_inverse(env.reader.arm_chains.jacobian(s.arms), force_t)).flatten(1)
+def arm_static_torque(env: H1Env) -> torch.Tensor:
+    """Torque (N, U) [Nm] that holds the arms still under gravity and the forces that acted in the last step."""
+    s = env.record.state
+    held = gravity_torque(env.upper_body.arms.inertias, s.arms, s.torso_rotation_w[:, 2])
+    force_t = rotate_inverse(s.torso_rotation_w.unsqueeze(1), env.hand_force_w)
+    return (held - rotate_inverse(env.reader.arm_chains.jacobian(s.arms), force_t)).flatten(1)
 
 
-def _row(env: H1Env, fell: torch.Tensor) -> dict[str, torch.Tensor]:
+def trajectory_row(env: H1Env, fell: torch.Tensor) -> dict[str, torch.Tensor]:
+    """One step's row (N, ...) of a `Trajectory`, just after `env.step`; `fell` (N,) from its extras."""
     r, upper = env.record, env.action_slices["upper"]
     s, hands = r.state, len(env.spec.arms)
     offset_t = (r.key_points_t - r.key_points_reference_t)[:, :hands]
@@ -146,6 +143,7 @@ def _row(env: H1Env, fell: torch.Tensor) -> dict[str, torch.Tensor]:
         "arm_velocity": s.joint_vel[:, upper],
         "arm_torque": r.torque[:, upper],
         "arm_at_limit": (r.torque[:, upper].abs() > 0.999 * env.arm_limits.flatten()).any(1),
+        "arm_static_torque": arm_static_torque(env),
         "hand_offset": offset_t @ (s.heading_w.transpose(1, 2) @ s.torso_rotation_w).transpose(1, 2),
         "hand_error": offset_t.norm(dim=2),
         "foot_contact": s.foot_contact,

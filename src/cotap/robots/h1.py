@@ -170,5 +170,6 @@ def h1() -> RobotSpec:
         joint_damping=facts["joint_damping"],
         joint_armature=facts["joint_armature"],
         nominal_height_m=1.0205,
+        menagerie="unitree_h1",
         colors=_COLORS,
     )

@@ -121,6 +121,8 @@ class RobotSpec:
     joint_armature: float
     nominal_height_m: float
     """Height of the torso link above flat ground in the default pose."""
+    menagerie: str = ""
+    """The robot's name in MuJoCo Menagerie, for those who have its meshes."""
     colors: dict[str, tuple[float, float, float]] = field(default_factory=dict)
 
     @cached_property

@@ -1,0 +1,92 @@
+"""`python -m cotap.play`: the shipped policy in the browser, to push, to lead, and to turn the stiffness of."""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import tyro
+
+if TYPE_CHECKING:
+    from viser import ViserServer
+
+    from cotap.play.app import App
+    from cotap.play.replay import Replay
+
+
+@dataclass
+class PlayOptions:
+    """A page on which a robot walks, is pushed, and has its stiffness turned."""
+
+    host: str = "127.0.0.1"
+    """Address to listen at. 127.0.0.1 is this machine only; 0.0.0.0 lets everybody in who can reach it."""
+    port: int = 8080
+    """Port to listen at."""
+    checkpoint: tuple[str, ...] = ()
+    """Checkpoints to choose from beside the shipped ones; the first of these runs at first."""
+    replay: str = ""
+    """Show this recording (.npz) instead of simulating."""
+    output: str = "runs/play"
+    """Folder for recordings and films."""
+    seed: int = 0
+    """Seed of the robots' starts."""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Open the page and run it. Returns the exit status: 0, or 2 for bad input."""
+    options = tyro.cli(PlayOptions, args=argv, prog="python -m cotap.play")
+    try:
+        return _run(options)
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("stopped")
+        return 0
+
+
+def _run(options: PlayOptions) -> int:
+    begin = time.perf_counter()
+    try:
+        from cotap.play.server import open_server
+    except ImportError as error:
+        raise ValueError(f"the page needs viser and mjviser ({error}): pip install 'cotap[play]'") from error
+    server = open_server(options.host, options.port)
+    try:
+        # The page answers while torch, the policy and the model are still being loaded.
+        loading = server.gui.add_markdown("Loading the simulation ...")
+        print(f"open http://{'localhost' if options.host in ('127.0.0.1', '0.0.0.0') else options.host}:{options.port}")
+        app = _replay(options, server) if options.replay else _live(options, server)
+        loading.remove()
+        print(f"ready after {time.perf_counter() - begin:.1f} s; Ctrl-C ends it", flush=True)
+        app.run()
+    finally:
+        server.stop()
+    return 0
+
+
+def _live(options: PlayOptions, server: ViserServer) -> App:
+    import torch
+
+    from cotap.evaluation.policy import SHIPPED, shipped_checkpoint
+    from cotap.play.app import App
+    from cotap.play.session import Session
+
+    torch.set_num_threads(1)  # two robots: more would only wait for each other
+    checkpoints = {path: Path(path) for path in options.checkpoint}
+    checkpoints |= {f"shipped {stage}": shipped_checkpoint(stage) for stage in SHIPPED}
+    return App(server, Session(checkpoints, options.seed), Path(options.output))
+
+
+def _replay(options: PlayOptions, server: ViserServer) -> Replay:
+    from cotap.evaluation.recording import load_recording
+    from cotap.play.replay import Replay
+
+    return Replay(server, load_recording(options.replay), Path(options.replay))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

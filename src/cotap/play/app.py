@@ -1,0 +1,207 @@
+"""The page and the simulation together: one thread simulates, one draws, the server's own threads listen."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import viser
+
+from cotap.play.archive import Archive
+from cotap.play.controls import ROBOTS
+from cotap.play.forces import Push
+from cotap.play.mailbox import Mailbox, Record, Reset, Step
+from cotap.play.notices import Notices
+from cotap.play.pace import Pace
+from cotap.play.panel import Panel
+from cotap.play.plots import Plots
+from cotap.play.recorder import Recorder
+from cotap.play.sample import Sample
+from cotap.play.scene import Scene
+from cotap.play.session import Session
+
+DRAW_HZ, PLOT_HZ, STATUS_HZ = 25.0, 4.0, 2.0
+
+
+class App:
+    """Everything that runs while a page is open.
+
+    Args:
+        server: The page, opened.
+        session: What is simulated.
+        folder: Where recordings go.
+    """
+
+    def __init__(self, server: viser.ViserServer, session: Session, folder: Path) -> None:
+        self.session, self.server = session, server
+        self.mailbox = Mailbox(session.controls)
+        self.notices = Notices(server)
+        self.archive = Archive(folder, self.notices)
+        self.pace = Pace(session.dt)
+        self._stop = threading.Event()
+        self._failure: BaseException | None = None
+        self._recorder: Recorder | None = None
+        self._latest: tuple[int, Sample] | None = None
+        with server.atomic():
+            self.scene = Scene(server, session.env.spec, len(ROBOTS))
+            self.panel = Panel(server, self.mailbox, session.sides, self.notices)
+            self._add_tabs()
+        self.scene.hands.on_drag("left")(self._drag)
+
+    def run(self) -> None:
+        """Simulate and draw until `stop`, or Ctrl-C. Raises what the simulation raises."""
+        thread = threading.Thread(target=self._simulate, name="simulation", daemon=True)
+        thread.start()
+        try:
+            self._draw_until_stopped()
+        finally:
+            self.stop()
+            thread.join(5.0)
+        if self._failure is not None:
+            raise self._failure
+
+    def stop(self) -> None:
+        """Let `run` return."""
+        self._stop.set()
+
+    def advance(self) -> None:
+        """One turn of the simulation's loop: take the mail, then step, or wait where there is nothing to do."""
+        values, requests = self.mailbox.take()
+        notices = self.session.set(values)
+        if notices:
+            self.panel.put_back({name: self.session.values[name] for name in values if name in self.session.values})
+        for notice in notices:
+            self.notices.tell(notice, title="not possible")
+        if "side_by_side" in values:
+            self._keep_recording()
+        step = False
+        for request in requests:
+            if isinstance(request, Push):
+                self.session.push(request)
+            elif isinstance(request, Reset):
+                self.session.reset()
+            elif isinstance(request, Step):
+                step = True
+            elif request.on:
+                self._begin_recording()
+            else:
+                self._keep_recording()
+        if (self.session.values["paused"] and not step) or self.archive.filming.is_set():
+            self.pace.rest()
+            return
+        self._step(values)
+        self.pace.wait(self.session.values["speed"])
+
+    def _step(self, changes: dict[str, Any]) -> None:
+        session = self.session
+        falls = list(session.falls)
+        sample = session.step()
+        self._latest = (session.num_steps, sample)
+        self.plots.append(session.num_steps, sample)
+        for i in range(self._shown()):
+            if session.falls[i] > falls[i]:
+                self.notices.tell(f"robot {ROBOTS[i].upper()} fell and is back on its feet", title="fall")
+        if self._recorder is not None:
+            self._recorder.append(sample, changes)
+            if self._recorder.full:
+                self._keep_recording()
+
+    def _shown(self) -> int:
+        return len(ROBOTS) if self.session.values["side_by_side"] else 1
+
+    def _simulate(self) -> None:
+        try:
+            while not self._stop.is_set():
+                self.advance()
+        except BaseException as error:  # whatever ends the simulation must end the program, and say so
+            self._failure = error
+            self._stop.set()
+
+    def _draw_until_stopped(self) -> None:
+        due = {"plots": 0.0, "status": 0.0}
+        drawn = None
+        while not self._stop.wait(1.0 / DRAW_HZ):
+            now = time.monotonic()
+            if now >= due["status"]:
+                due["status"] = now + 1.0 / STATUS_HZ
+                self._show_status()
+            latest = self._latest
+            if latest is None or self.archive.filming.is_set():
+                continue
+            self.scene.shown = self._shown()
+            self.scene.show(latest[1])
+            if now >= due["plots"] and latest is not drawn and self._live_plots.value:
+                due["plots"] = now + 1.0 / PLOT_HZ
+                self.plots.draw(self._shown())
+            drawn = latest
+
+    def _show_status(self) -> None:
+        s = self.session
+        rate = self.pace.rate
+        parts = [
+            f"**{s.num_steps * s.dt:.1f} s**",
+            "filming" if self.archive.filming.is_set() else "paused" if s.values["paused"] else
+            f"{rate:.0f} control steps/s ({rate * s.dt:.2f} of real time)",
+            f"falls: {', '.join(str(n) for n in s.falls[: self._shown()])}",
+        ]  # fmt: skip
+        if self._recorder is not None:
+            parts.append(f"**recording {self._recorder.seconds:.1f} s**")
+        self.panel.status.content = " · ".join(parts)
+
+    def _add_tabs(self) -> None:
+        gui = self.server.gui
+        with self.panel.tabs.add_tab("View"):
+            self._add_view()
+        with self.panel.tabs.add_tab("Record"):
+            for label, on in (("Start recording", True), ("Stop and save", False)):
+                self.panel.button(label, Record(on))
+            self.archive.add_buttons(gui, self.scene)
+        # Not in a tab: a plot that is made while it is hidden has no width.
+        with gui.add_folder("Plots") as folder:
+            self._live_plots = gui.add_checkbox("live", True)
+        self.plots = Plots(self.server, folder, self.session.sides, self.session.dt)
+
+    def _add_view(self) -> None:
+        gui, scene = self.server.gui, self.scene
+        for label, name in (
+            ("camera follows", "follow"), ("ellipsoids of stiffness", "ellipsoids"), ("contacts", "contacts"),
+        ):  # fmt: skip
+            box = gui.add_checkbox(label, True)
+
+            async def update(event: viser.GuiEvent[Any], name: str = name) -> None:
+                setattr(scene, name, bool(event.target.value))
+
+            box.on_update(update)
+        gui.add_markdown(
+            "Green: where the reference has the hand. Orange ball: the hand; drag it. Red arrow: force on it. "
+            "Blue wires: the stiffness asked for; orange: the effective one (30 cm for 1000 N/m). "
+            f"Shapes: {scene.shapes}."
+        )
+
+    async def _drag(self, event: viser.SceneNodeDragEvent[Any]) -> None:
+        if event.instance_index is None:
+            return
+        robot, hand = divmod(event.instance_index, len(self.session.sides))
+        point = None if event.phase == "end" else self.scene.to_robot(event.end_position, robot)
+        try:
+            self.mailbox.set(f"{ROBOTS[robot]}.{self.session.sides[hand]}.drag", point)
+        except ValueError as error:
+            self.notices.tell(str(error), event.client, "refused")
+
+    def _begin_recording(self) -> None:
+        if self._recorder is None:
+            self._recorder = Recorder(self.session.dt, self._shown(), self.session.describe())
+
+    def _keep_recording(self) -> None:
+        """End the recording, if there is one, and write it."""
+        recorder, self._recorder = self._recorder, None
+        if recorder is None:
+            return
+        try:
+            path = self.archive.keep(recorder.finish())
+        except (OSError, ValueError) as error:
+            self.notices.tell(str(error), title="not recorded")
+        else:
+            self.notices.tell(f"{recorder.seconds:.1f} s written to {path}", title="recorded")

@@ -1,0 +1,174 @@
+"""The page's controls. They only leave messages in the mailbox; what they show is what was accepted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import viser
+
+from cotap.play.controls import AXES, ROBOTS, Choice, Control, Flag, Number, Refused
+from cotap.play.forces import PUSH_N, PUSH_S, Push
+from cotap.play.mailbox import Mailbox, Request, Reset, Step
+from cotap.play.notices import Notices
+
+DIRECTIONS: dict[str, tuple[float, float, float]] = {
+    "forward": (1.0, 0.0, 0.0), "backward": (-1.0, 0.0, 0.0), "left": (0.0, 1.0, 0.0), "right": (0.0, -1.0, 0.0),
+    "up": (0.0, 0.0, 1.0), "down": (0.0, 0.0, -1.0),
+}  # fmt: skip
+
+
+class Panel:
+    """Every control, in tabs.
+
+    Args:
+        server: The page.
+        mailbox: Where settings and requests go.
+        sides: The arms.
+        notices: Where people are told what was refused.
+    """
+
+    def __init__(self, server: viser.ViserServer, mailbox: Mailbox, sides: tuple[str, ...], notices: Notices) -> None:
+        self._gui, self._mailbox, self._sides, self._notices = server.gui, mailbox, sides, notices
+        self._handles: dict[str, Any] = {}
+        self._good: dict[str, Any] = {name: control.default for name, control in mailbox.controls.items()}
+        self._second: list[Any] = []
+        self.status = server.gui.add_markdown("")
+        self._add_time()
+        self.tabs = server.gui.add_tab_group()
+        with self.tabs.add_tab("Walk"):
+            self._add_walk()
+        with self.tabs.add_tab("Arms"):
+            for robot in ROBOTS:
+                self._add_arms(robot)
+        with self.tabs.add_tab("Push"):
+            self._add_push()
+        with self.tabs.add_tab("Domain"):
+            self._add_domain()
+        self._show_second(False)
+
+    def put_back(self, values: Mapping[str, Any]) -> None:
+        """Show values as the simulation has them, where it could not take what was asked for."""
+        for name, value in values.items():
+            self._good[name] = value
+            if name in self._handles:
+                self._handles[name].value = value
+
+    def bind(self, name: str) -> Any:
+        """The control called `name`, added in the present container."""
+        control = self._mailbox.controls[name]
+        handle = self._add(control)
+        self._handles[name] = handle
+
+        # Coroutines run one by one on the server's loop: a flood cannot pile up threads, and order is kept.
+        async def update(event: viser.GuiEvent[Any]) -> None:
+            if event.client_id is not None:  # else it is this program that writes
+                self._set(name, event.target.value, event.client)
+
+        handle.on_update(update)
+        return handle
+
+    def _add(self, control: Control) -> Any:
+        if isinstance(control, Number):
+            return self._gui.add_slider(
+                control.label, min=control.low, max=control.high, step=control.step, initial_value=control.default
+            )
+        if isinstance(control, Choice):
+            return self._gui.add_dropdown(control.label, options=control.options, initial_value=control.default)
+        if isinstance(control, Flag):
+            return self._gui.add_checkbox(control.label, initial_value=control.default)
+        raise TypeError(f"{control.label} is not a control of the panel")
+
+    def _set(self, name: str, value: Any, client: viser.ClientHandle | None) -> None:
+        try:
+            clean, notice = self._mailbox.set(name, value)
+        except Refused as refusal:
+            clean, notice = self._good[name], str(refusal)
+        if notice:
+            self._notices.tell(notice, client, "not as sent")
+            self._handles[name].value = clean
+        self._good[name] = clean
+        if name == "side_by_side":
+            self._show_second(clean)
+
+    def _ask(self, request: Request, client: viser.ClientHandle | None) -> None:
+        try:
+            self._mailbox.ask(request)
+        except Refused as refusal:
+            self._notices.tell(str(refusal), client, "refused")
+
+    def button(self, label: str, request: Request) -> None:
+        """A button, in the present container, that leaves a request."""
+        self._button(label, lambda: request)
+
+    def _button(self, label: str, request: Callable[[], Request]) -> None:
+        async def click(event: viser.GuiEvent[Any]) -> None:
+            try:
+                asked = request()
+            except Refused as refusal:
+                self._notices.tell(str(refusal), event.client, "refused")
+            else:
+                self._ask(asked, event.client)
+
+        self._gui.add_button(label).on_click(click)
+
+    def _add_time(self) -> None:
+        with self._gui.add_folder("Time"):
+            self.bind("paused")
+            self.bind("speed")
+            self.button("Step", Step())
+            self.button("Reset", Reset())
+            self.bind("side_by_side")
+
+    def _add_walk(self) -> None:
+        for name in ("stand", "velocity_x", "velocity_y", "yaw_rate", "height_offset", "motion", "arm_actions"):
+            self.bind(name)
+
+    def _add_arms(self, robot: str) -> None:
+        for side in self._sides:
+            with self._gui.add_folder(f"Robot {robot.upper()}, {side} arm", expand_by_default=robot == "a") as folder:
+                for part in ("law", *(f"stiffness_{axis}" for axis in AXES), "null_stiffness", "alpha"):
+                    self.bind(f"{robot}.{side}.{part}")
+                with self._gui.add_folder("more", expand_by_default=False):
+                    for part in ("error", "damping"):
+                        self.bind(f"{robot}.{side}.{part}")
+            if robot != ROBOTS[0]:
+                self._second.append(folder)
+
+    def _add_push(self) -> None:
+        hand = self._gui.add_dropdown("hand", self._sides)
+        force = self._gui.add_slider("force [N]", min=0.0, max=PUSH_N, step=5.0, initial_value=60.0)
+        seconds = self._gui.add_slider("for [s]", min=0.02, max=PUSH_S, step=0.02, initial_value=0.5)
+        for label, direction in DIRECTIONS.items():
+            self._button(
+                f"Push {label}",
+                lambda d=direction: make_push(self._sides, hand.value, force.value, seconds.value, d),
+            )
+        with self._gui.add_folder("Held load, axes of the robot's heading"):
+            for side in self._sides:
+                for axis in AXES:
+                    self.bind(f"held.{side}.{axis}")
+        self._gui.add_markdown("Drag an orange ball with the mouse: a spring pulls that hand after it.")
+
+    def _add_domain(self) -> None:
+        for robot in ROBOTS:
+            with self._gui.add_folder(f"Robot {robot.upper()}") as folder:
+                for part in ("checkpoint", "friction", "mass_scale", "load_kg"):
+                    self.bind(f"{robot}.{part}")
+            if robot != ROBOTS[0]:
+                self._second.append(folder)
+
+    def _show_second(self, on: bool) -> None:
+        for folder in self._second:
+            folder.visible = on
+
+
+def make_push(
+    sides: tuple[str, ...], side: object, force: object, seconds: object, direction: tuple[float, float, float]
+) -> Push:
+    """A push from what the page's fields hold, within its limits. Raises Refused for no number and no hand."""
+    hand, _ = Choice("hand", sides, sides[0]).clean(side)
+    size, _ = Number("force [N]", 0.0, PUSH_N, 0.0, 0.0).clean(force)
+    duration, _ = Number("duration [s]", 0.02, PUSH_S, 0.0, 0.0).clean(seconds)
+    x, y, z = (size * d for d in direction)
+    return Push(hand, (x, y, z), duration)

@@ -1,0 +1,96 @@
+"""A recording shown again: the same scene and plots, a slider for the time."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import viser
+
+from cotap.evaluation.recording import Recording, RecordingError
+from cotap.play.archive import Archive
+from cotap.play.notices import Notices
+from cotap.play.plots import SECONDS, Plots
+from cotap.play.recorder import samples_of
+from cotap.play.scene import Scene
+from cotap.robots import ROBOTS as KNOWN_ROBOTS
+
+DRAW_HZ = 25.0
+
+
+class Replay:
+    """Plays one recording over and over.
+
+    Args:
+        server: The page, opened.
+        recording: What to show.
+        path: Where it was read; a film is written beside it.
+
+    Raises:
+        RecordingError: it is of a robot that this cotap does not know.
+    """
+
+    def __init__(self, server: viser.ViserServer, recording: Recording, path: Path) -> None:
+        robot = recording.settings.get("robot")
+        if robot not in KNOWN_ROBOTS:
+            raise RecordingError(f"the recording's robot {robot!r} is unknown; known: {', '.join(KNOWN_ROBOTS)}")
+        self._samples, self._dt = samples_of(recording), recording.trajectory.dt
+        spec = KNOWN_ROBOTS[robot]()
+        self._count = recording.trajectory.fell.shape[1]
+        self._stop = threading.Event()
+        self.scene = Scene(server, spec, self._count)
+        self.scene.shown = self._count
+        archive = Archive(path.parent, Notices(server))
+        archive.newest, archive.path = recording, path
+        self._filming = archive.filming
+        gui = server.gui
+        gui.add_markdown(f"**{path.name}**, {len(self._samples) * self._dt:.1f} s")
+        self._playing = gui.add_checkbox("play", True)
+        self._speed = gui.add_slider("speed", min=0.1, max=4.0, step=0.1, initial_value=1.0)
+        self._time = gui.add_slider(
+            "time [s]",
+            min=0.0,
+            max=max(self._dt, self._dt * (len(self._samples) - 1)),
+            step=self._dt,
+            initial_value=0.0,
+        )
+        self._at = 0.0
+        self._time.on_update(self._seek)
+        archive.add_buttons(gui, self.scene)
+        with gui.add_folder("Plots") as folder:
+            gui.add_markdown(f"The last {SECONDS:g} s before what is shown.")
+        self._plots = Plots(server, folder, tuple(arm.side for arm in spec.arms), self._dt)
+
+    def run(self) -> None:
+        """Show it until `stop`, or Ctrl-C."""
+        last, plotted = time.monotonic(), -1.0
+        while not self._stop.wait(1.0 / DRAW_HZ):
+            now = time.monotonic()
+            passed, last = now - last, now
+            if self._filming.is_set():
+                continue
+            if self._playing.value:
+                self._at = (self._at + passed * float(self._speed.value)) % (len(self._samples) * self._dt)
+            step = min(int(self._at / self._dt), len(self._samples) - 1)
+            self.scene.show(self._samples[step])
+            if self._playing.value:
+                self._time.value = round(step * self._dt, 6)
+            if now - plotted > 0.5:
+                plotted = now
+                self._plot(step)
+
+    def stop(self) -> None:
+        """Let `run` return."""
+        self._stop.set()
+
+    def _plot(self, step: int) -> None:
+        self._plots.clear()
+        for i in range(max(0, step - round(SECONDS / self._dt)), step + 1):
+            self._plots.append(i, self._samples[i])
+        self._plots.draw(self._count)
+
+    async def _seek(self, event: viser.GuiEvent[Any]) -> None:
+        if event.client_id is not None:  # a person's hand, not the clock
+            self._at = min(max(float(event.target.value), 0.0), self._dt * (len(self._samples) - 1))

@@ -1,0 +1,73 @@
+"""What one control step looks like: the row of a trajectory, and what the page draws beside it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+
+from cotap.envs import H1Env
+from cotap.evaluation.rollout import trajectory_row
+
+Sample = dict[str, np.ndarray]
+"""One step of W robots, (W, ...) each, by the names of `Trajectory` and of `recording.SCENE`."""
+
+COMMANDS_NO_STIFFNESS = ("pd", "soft-pd")
+"""Laws whose K_ee means nothing."""
+
+
+def take_sample(env: H1Env, fell: torch.Tensor, laws: list[list[str]], force_h: torch.Tensor) -> Sample:
+    """The step that `env` has just made.
+
+    Args:
+        env: W worlds.
+        fell: (W,) bool from the step's extras.
+        laws: [W][H] names of the arms' laws.
+        force_h: (W, H, 3) what pulled on the hands [N].
+    """
+    state, reference = env.record.state, env.record.reference.position
+    points_w, reference_w = _hands_w(env, reference)
+    jacobian_h = _to_heading(env).unsqueeze(1) @ env.reader.arm_chains.jacobian(state.arms)
+    stiffness = env.arm_stiffness()
+    none = [[law in COMMANDS_NO_STIFFNESS for law in row] for row in laws]
+    commanded = env.upper_body.parameters.stiffness.masked_fill(torch.tensor(none).unsqueeze(-1), math.nan)
+    eigenvalues = torch.linalg.eigvalsh(stiffness)
+    scene = {
+        "qpos": env.sim.qpos.clone(),
+        "hand_w": points_w,
+        "hand_reference_w": reference_w,
+        "hand_force_w": (state.heading_w.unsqueeze(1) @ force_h.unsqueeze(-1)).squeeze(-1),
+        "heading_w": state.heading_w,
+        "commanded_stiffness": commanded,
+        "effective_stiffness": effective_stiffness(jacobian_h, stiffness),
+        "stiffness_eigenvalues": eigenvalues[..., [0, -1]],
+    }
+    return {name: value.numpy() for name, value in (trajectory_row(env, fell) | scene).items()}
+
+
+def effective_stiffness(jacobian: torch.Tensor, joint_stiffness: torch.Tensor) -> torch.Tensor:
+    """Static stiffness `(J K^-1 J^T)^-1` (..., 3, 3) that a force at the hand meets [N/m], gravity aside.
+
+    Args:
+        jacobian: (..., 3, n) of the hand [m/rad].
+        joint_stiffness: (..., n, n) symmetric positive definite [Nm/rad].
+    """
+    j, k = jacobian.double(), joint_stiffness.double()
+    compliance = j @ torch.linalg.solve(k, j.transpose(-1, -2))
+    # A straight arm does not give along itself at all; a micrometre per newton stands for that.
+    rigid = 1e-6 * torch.eye(3, dtype=torch.float64)
+    return torch.linalg.inv(compliance + rigid).float()
+
+
+def _to_heading(env: H1Env) -> torch.Tensor:
+    s = env.record.state
+    return s.heading_w.transpose(1, 2) @ s.torso_rotation_w
+
+
+def _hands_w(env: H1Env, reference: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Hands and their references (W, H, 3) in the world; the reference is carried in the torso frame."""
+    s = env.record.state
+    wanted = env.reader.arm_chains.pose(reference.unflatten(1, (len(env.spec.arms), -1))).tip
+    place = [s.torso_pos_w.unsqueeze(1) + p @ s.torso_rotation_w.transpose(1, 2) for p in (s.arms.tip, wanted)]
+    return place[0], place[1]

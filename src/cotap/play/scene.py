@@ -1,0 +1,158 @@
+"""The three-dimensional part of the page: robots, hands, forces, ellipsoids of stiffness, contacts, the floor."""
+
+from __future__ import annotations
+
+import numpy as np
+import trimesh
+import viser
+from mjviser import ViserMujocoScene
+from viser import transforms as tf
+
+from cotap.play.sample import Sample
+from cotap.play.visuals import RobotPose, visual_model
+from cotap.robots import RobotSpec
+
+APART_M = 1.5
+"""How far to its right the second robot is shown from where its own world has it [m]."""
+ELLIPSOID_M = 3e-4
+"""Half axis of an ellipsoid of stiffness per stiffness [m per N/m]: 30 cm for 1000 N/m."""
+ELLIPSOID_MAX_M = 0.5
+"""Longest half axis: along a straight arm there is no end to the stiffness [m]."""
+ARROW_M = 0.004
+"""Length of a force's arrow per force [m/N]."""
+ARROW_MAX_M = 1.5
+"""Longest arrow [m]."""
+HAND_M, REFERENCE_M = 0.055, 0.04
+"""Radii of the balls at hands and at their references [m]."""
+HIDDEN = 1e-6
+"""Scale of what is not there: sizes of batches stay as they are."""
+HAND, REFERENCE, FORCE, CONTACT = (230, 120, 40), (40, 170, 80), (200, 30, 50), (230, 153, 51)
+COMMANDED, EFFECTIVE = (40, 110, 220), (240, 150, 60)
+
+
+class Scene:
+    """Draws samples. Robots' worlds are their own; here they stand beside each other.
+
+    Args:
+        server: Where to draw.
+        spec: The robot.
+        count: How many robots samples hold.
+    """
+
+    def __init__(self, server: viser.ViserServer, spec: RobotSpec, count: int) -> None:
+        self.shown, self.follow = 1, True
+        self.ellipsoids, self.contacts = True, True
+        self._server, self._count, self._hands = server, count, len(spec.arms)
+        model, self.shapes = visual_model(spec)
+        self._pose = RobotPose(spec, model)
+        self._robots = ViserMujocoScene(server, model, count)
+        self._robots.camera_tracking_enabled = False
+        self._add_surroundings()
+        ball = trimesh.creation.icosphere(subdivisions=2)
+        self.hands = self._batch("hands", ball, HAND, HAND_M)
+        """Balls at the hands, robot by robot, to be taken hold of."""
+        self._references = self._batch("references", ball, REFERENCE, REFERENCE_M)
+        self._effective = self._batch("effective", trimesh.creation.icosphere(subdivisions=3), EFFECTIVE, 0.0, 0.35)
+        self._commanded = self._batch("commanded", ball, COMMANDED, 0.0, wireframe=True)
+        self._arrows = server.scene.add_arrows(
+            "/forces", np.zeros((1, 2, 3)), FORCE, shaft_radius=0.012, head_radius=0.03, head_length=0.06, visible=False
+        )
+        self._contact_points = server.scene.add_point_cloud(
+            "/contacts", np.zeros((1, 3)), CONTACT, point_size=0.025, point_shape="circle", visible=False
+        )
+        self._offset = np.zeros((count, 3))
+
+    def show(self, sample: Sample) -> None:
+        """Draw one step."""
+        poses = [self._pose.of(qpos) for qpos in sample["qpos"]]
+        apart = np.array([[0.0, -APART_M * i, 0.0] for i in range(self._count)])
+        # Following moves the world, not people's cameras: those stay theirs to turn.
+        centre = sample["qpos"][: self.shown, :2].mean(0) if self.follow else np.zeros(2)
+        middle = apart[: self.shown].mean(0) if self.follow else np.zeros(3)
+        self._offset = apart - middle - np.array([*centre, 0.0])
+        with self._server.atomic():
+            self._floor.position = self._offset[0]
+            self._robots.show_only_selected = self.shown < self._count
+            self._robots.update_from_arrays(
+                np.stack([p[0] for p in poses]) + self._offset[:, None], np.stack([p[1] for p in poses]), env_idx=0
+            )
+            self._show_hands(sample)
+            self._show_forces(sample)
+            self._show_contacts([p[2] for p in poses])
+        self._server.flush()
+
+    def to_robot(self, point: tuple[float, float, float], robot: int) -> tuple[float, ...]:
+        """A point of the page in the world of a robot."""
+        return tuple(float(v) for v in np.asarray(point) - self._offset[robot])
+
+    def _add_surroundings(self) -> None:
+        scene = self._server.scene
+        scene.configure_environment_map(environment_intensity=0.25)
+        self._floor = scene.add_frame("/floor", show_axes=False)
+        scene.add_grid(
+            "/floor/grid", infinite_grid=True, cell_size=0.5, section_size=1.0, fade_distance=25.0, plane_opacity=0.5,
+            shadow_opacity=0.25,
+        )  # fmt: skip
+        self._server.initial_camera.position = (2.9, 1.5, 1.5)
+        self._server.initial_camera.look_at = (0.0, 0.35, 0.8)  # the panel covers the right
+
+    def _batch(
+        self, name: str, mesh: trimesh.Trimesh, color: tuple[int, int, int], size: float, opacity: float | None = None,
+        wireframe: bool = False,
+    ) -> viser.BatchedMeshHandle:  # fmt: skip
+        """One mesh for every hand of every robot."""
+        n = self._count * self._hands
+        return self._server.scene.add_batched_meshes_simple(
+            f"/{name}", mesh.vertices, mesh.faces, np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)), np.zeros((n, 3)),
+            batched_scales=np.full((n, 3), max(size, HIDDEN)), batched_colors=color, opacity=opacity,
+            wireframe=wireframe, cast_shadow=False, receive_shadow=False, lod="off",
+        )  # fmt: skip
+
+    def _visible(self) -> np.ndarray:
+        """(W, H, 1) 1 for what belongs to a robot that is shown, else nearly 0."""
+        shown = np.where(np.arange(self._count) < self.shown, 1.0, HIDDEN)
+        return np.broadcast_to(shown[:, None, None], (self._count, self._hands, 1))
+
+    def _show_hands(self, s: Sample) -> None:
+        place, visible = self._offset[:, None], self._visible()
+        hands = _batched(s["hand_w"] + place)
+        self.hands.batched_positions = hands
+        self._references.batched_positions = _batched(s["hand_reference_w"] + place)
+        for handle, size in ((self.hands, HAND_M), (self._references, REFERENCE_M)):
+            handle.batched_scales = _batched(np.repeat(size * visible, 3, 2))
+        heading = np.repeat(s["heading_w"][:, None], self._hands, 1)
+        commanded = np.nan_to_num(s["commanded_stiffness"], nan=0.0)
+        values, axes = np.linalg.eigh(s["effective_stiffness"])
+        axes[..., 0] *= np.sign(np.linalg.det(axes))[..., None]  # a rotation, not a reflection
+        for handle, stiffness, rotation in (
+            (self._commanded, commanded, heading), (self._effective, values, heading @ axes),
+        ):  # fmt: skip
+            size = np.clip(ELLIPSOID_M * stiffness, HIDDEN, ELLIPSOID_MAX_M) * (visible if self.ellipsoids else HIDDEN)
+            handle.batched_positions = hands
+            turn = tf.SO3.from_matrix(rotation.reshape(-1, 3, 3).astype(np.float64))
+            handle.batched_wxyzs = turn.wxyz.astype(np.float32)
+            handle.batched_scales = _batched(np.maximum(size, HIDDEN))
+
+    def _show_forces(self, s: Sample) -> None:
+        force = s["hand_force_w"][: self.shown].reshape(-1, 3)
+        size = np.linalg.norm(force, axis=1)
+        on = size > 0.1
+        self._arrows.visible = bool(on.any())
+        if on.any():
+            tip = (s["hand_w"] + self._offset[:, None])[: self.shown].reshape(-1, 3)[on]
+            length = np.minimum(ARROW_M * size[on] + 0.06, ARROW_MAX_M)
+            # The arrow ends where it pushes.
+            start = tip - force[on] / size[on, None] * length[:, None]
+            self._arrows.points = np.stack((start, tip), 1).astype(np.float32)
+
+    def _show_contacts(self, contacts: list[np.ndarray]) -> None:
+        points = [c + self._offset[i] for i, c in enumerate(contacts[: self.shown])]
+        points = np.concatenate(points) if points else np.zeros((0, 3))
+        self._contact_points.visible = bool(len(points)) and self.contacts
+        if len(points):
+            self._contact_points.points = points.astype(np.float32)
+
+
+def _batched(values: np.ndarray) -> np.ndarray:
+    """(W, H, 3) as browsers take it, (W H, 3)."""
+    return values.reshape(-1, 3).astype(np.float32)

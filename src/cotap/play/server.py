@@ -1,0 +1,49 @@
+"""The web server: opened where it was asked for, or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+
+import viser
+
+from cotap.checks import require_range
+
+
+class PortTaken(OSError):
+    """The page cannot be opened where it was asked for; the message says what to do."""
+
+
+def open_server(host: str, port: int) -> viser.ViserServer:
+    """A page at `http://host:port`.
+
+    Raises:
+        PortTaken: another program has the port, or the address is not this machine's.
+        ValueError: the port is out of its range.
+    """
+    require_range("port", port, 1, 65535)
+    _require_free(host, port)
+    server = viser.ViserServer(host=host, port=port, label="cotap", verbose=False)
+    if server.get_port() != port:  # taken in between: viser goes on to the next
+        server.stop()
+        raise PortTaken(_advice(host, port, "another program has just taken it"))
+    # People's simulations stay theirs: no public tunnel at the push of a button.
+    server.gui.configure_theme(show_share_button=False, show_logo=False, control_width="large")
+    return server
+
+
+def _require_free(host: str, port: int) -> None:
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        with contextlib.closing(socket.socket(family, kind, protocol)) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(address)
+    except OSError as error:
+        raise PortTaken(_advice(host, port, error.strerror or str(error))) from error
+
+
+def _advice(host: str, port: int, reason: str) -> str:
+    return (
+        f"cannot open the page at {host}:{port} ({reason}). Is another cotap.play running? Take another port with "
+        f"--port {port + 1 if port < 65535 else 8080}, or stop the program that has it"
+    )

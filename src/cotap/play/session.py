@@ -1,0 +1,216 @@
+"""The simulation behind the page: two robots in one batch, what the page asks of them, one step at a time."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from cotap.agents.actors import as_dict
+from cotap.agents.checkpoint import require_layout, sha256
+from cotap.compliance.laws import LAWS, LawConfig
+from cotap.configs import from_plain
+from cotap.envs import H1Env, H1EnvConfig
+from cotap.envs.commands import STEADY_RAD
+from cotap.envs.reference import REST
+from cotap.evaluation.policy import Policy, load_policy
+from cotap.play.controls import AXES, ROBOTS, Control, Ranges, make_controls
+from cotap.play.forces import HandLoads, Push
+from cotap.play.sample import Sample, take_sample
+
+
+class Session:
+    """Robots a and b, always both simulated: a batch of two costs what one does. `controls` is what may be set.
+
+    Robots start in the same state, facing along x, and get the same commands, forces and arm motion; laws, policy and
+    domain are their own.
+
+    Args:
+        checkpoints: Policies to choose from, by the names that are shown; the first runs at first.
+        seed: Of the robots' starts.
+
+    Raises:
+        CheckpointError: the first checkpoint cannot be used.
+    """
+
+    def __init__(self, checkpoints: Mapping[str, Path], seed: int = 0) -> None:
+        self._checkpoints, self._seed = dict(checkpoints), seed
+        first = next(iter(self._checkpoints))
+        policy = load_policy(self._checkpoints[first])
+        self.env = H1Env(play_config(from_plain(H1EnvConfig, policy.config["training"]["env"])))
+        self._loaded: dict[str, Policy] = {}
+        self._policies = [self._policy(first)] * len(ROBOTS)
+        env = self.env
+        self.sides = tuple(arm.side for arm in env.spec.arms)
+        clips = env.motions.clips.names if env.motions.clips else []
+        c = env.cfg.commands
+        self.controls: dict[str, Control] = make_controls(
+            Ranges(
+                c.velocity_x, c.velocity_y, c.yaw_rate, c.height_offset,
+                self.sides, tuple(LAWS), (REST, *clips), tuple(self._checkpoints),
+            )
+        )  # fmt: skip
+        self.values: dict[str, Any] = {name: control.default for name, control in self.controls.items()}
+        self.loads = HandLoads(len(ROBOTS), self.sides, env.dt)
+        env.scripted.active = True
+        self.num_steps = 0
+        self.falls = [0] * len(ROBOTS)
+        self._apply_all()
+        self.reset()
+
+    @property
+    def dt(self) -> float:
+        """Control step [s]."""
+        return self.env.dt
+
+    @torch.inference_mode()
+    def set(self, values: Mapping[str, Any]) -> list[str]:
+        """Bring values, cleaned by their controls, into force. Returns what to tell people.
+
+        Values that cannot be brought into force, such as a checkpoint that does not fit, are put back.
+        """
+        notices = []
+        for name, value in values.items():
+            before, self.values[name] = self.values[name], value
+            try:
+                self._apply(name)
+            except (ValueError, OSError) as error:
+                self.values[name] = before
+                notices.append(str(error))
+        return notices
+
+    def push(self, push: Push) -> None:
+        """Push every robot's hand."""
+        self.loads.push(push)
+
+    @torch.inference_mode()
+    def reset(self) -> None:
+        """Put both robots on their feet in the same state; pushes end."""
+        self.loads.clear()
+        self._observations = self.env.reset_alike(self._seed)
+        self._face_forward(torch.ones(self.env.num_envs, dtype=torch.bool))
+
+    @torch.inference_mode()
+    def step(self) -> Sample:
+        """Advance by one control step."""
+        env = self.env
+        s = env.state
+        hands = s.torso_pos_w.unsqueeze(1) + s.arms.tip @ s.torso_rotation_w.transpose(1, 2)
+        force_h = self.loads.step(hands, s.heading_w)
+        env.scripted.amplitude_h = force_h
+        self._observations, _, done, extras = env.step(self._act())
+        self.num_steps += 1
+        laws = [[self.values[f"{robot}.{side}.law"] for side in self.sides] for robot in ROBOTS]
+        sample = take_sample(env, extras["falls"], laws, force_h)
+        for i, fell in enumerate(extras["falls"].tolist()):
+            self.falls[i] += fell
+        if done.any():
+            self._face_forward(done)
+        return sample
+
+    def describe(self) -> dict[str, Any]:
+        """What a recording keeps beside its arrays."""
+        return {
+            "robot": self.env.spec.name,
+            "sides": list(self.sides),
+            "gait_period_s": self.env.cfg.commands.gait_period_s,
+            "values": {name: value for name, value in self.values.items() if not name.endswith(".drag")},
+            "checkpoints_sha256": {r: sha256(self._checkpoints[self.values[f"{r}.checkpoint"]]) for r in ROBOTS},
+        }
+
+    def _act(self) -> torch.Tensor:
+        observations = as_dict(self._observations)
+        actions = self._policies[0](observations)
+        if self._policies[1] is not self._policies[0]:
+            actions = torch.cat((actions[:1], self._policies[1](observations)[1:]))
+        if not self.values["arm_actions"]:
+            actions = actions.clone()
+            actions[:, self.env.action_slices["upper"]] = 0.0
+        return actions
+
+    def _policy(self, name: str) -> Policy:
+        """The policy called `name`. Raises CheckpointError if it is unusable, or not for this environment."""
+        if name not in self._loaded:
+            path = self._checkpoints[name]
+            policy = load_policy(path)
+            require_layout(path, policy.layout, json.loads(json.dumps(self.env.layout())))
+            self._loaded[name] = policy
+        return self._loaded[name]
+
+    def _apply_all(self) -> None:
+        for name in ("velocity_x", "motion", *(f"{r}.{part}" for r in ROBOTS for part in ("friction", "mass_scale"))):
+            self._apply(name)
+        for robot in ROBOTS:
+            for side in self.sides:
+                self._apply(f"{robot}.{side}.law")
+
+    def _apply(self, name: str) -> None:
+        """Bring one value into force."""
+        head, *rest = name.split(".")
+        if head in ROBOTS:
+            self._apply_to_robot(ROBOTS.index(head), rest)
+        elif head == "held":
+            side = rest[0]
+            force = torch.tensor([self.values[f"held.{side}.{axis}"] for axis in AXES])
+            self.loads.held_h[self.sides.index(side)] = force
+        elif head == "motion":
+            self.env.motions.lead(self.values["motion"])
+        elif head in ("velocity_x", "velocity_y", "yaw_rate", "height_offset", "stand"):
+            self._command()
+
+    def _apply_to_robot(self, world: int, rest: list[str]) -> None:
+        value = self.values[".".join((ROBOTS[world], *rest))]
+        if rest[0] in self.sides:
+            arm = self.sides.index(rest[0])
+            if rest[1] == "drag":
+                self.loads.drag_w[world][arm] = value
+            else:
+                self.env.set_law(world, arm, self._law(world, rest[0]))
+        elif rest[0] == "checkpoint":
+            self._policies[world] = self._policy(value)
+        elif rest[0] == "friction":
+            mask = torch.arange(self.env.num_envs) == world
+            self.env.randomizer.set_friction(mask, torch.tensor([value]))
+        else:
+            self._set_mass()
+
+    def _law(self, world: int, side: str) -> LawConfig:
+        own = {n: self.values[f"{ROBOTS[world]}.{side}.{n}"] for n in ("null_stiffness", "alpha", "error", "damping")}
+        x, y, z = (self.values[f"{ROBOTS[world]}.{side}.stiffness_{axis}"] for axis in AXES)
+        return replace(LawConfig(self.values[f"{ROBOTS[world]}.{side}.law"], (x, y, z)), **own)
+
+    def _set_mass(self) -> None:
+        scale = torch.tensor([self.values[f"{r}.mass_scale"] for r in ROBOTS])
+        load = torch.tensor([self.values[f"{r}.load_kg"] for r in ROBOTS])
+        bodies = self.env.sim.model.nbody
+        self.env.randomizer.set_mass(scale.unsqueeze(1).expand(-1, bodies), load)
+
+    def _command(self) -> None:
+        v, n = self.values, len(ROBOTS)
+        stand = v["stand"]
+        velocity = torch.tensor([0.0, 0.0] if stand else [v["velocity_x"], v["velocity_y"]]).repeat(n, 1)
+        yaw_rate = torch.full((n,), 0.0 if stand else v["yaw_rate"])
+        height = torch.full((n,), self.env.spec.nominal_height_m + v["height_offset"])
+        self.env.commands.override(velocity, yaw_rate, torch.full((n,), float(stand)), height)
+
+    def _face_forward(self, mask: torch.Tensor) -> None:
+        """Turn worlds that have just restarted along x. Nothing that is observed depends on it."""
+        env = self.env
+        env.sim.qpos[mask, 3:7] = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+        env.state = env.reader.read()
+
+
+def play_config(env: H1EnvConfig) -> H1EnvConfig:
+    """Turn the environment that a policy was trained in into the page's. Changes and returns `env`."""
+    env.num_envs, env.num_threads = len(ROBOTS), 1
+    env.assist.enabled = env.hand_forces.enabled = env.randomization.enabled = False
+    env.observations.noise.enabled = False
+    env.terminations.episode_s = 1e6
+    env.impedance.share, env.commands.steady_rad = 0.0, STEADY_RAD
+    env.motions.clips.share, env.motions.clips.only, env.motions.clips.held_out = 1.0, (), ()
+    env.force.force, env.force.start_s, env.force.duration_s = (0.0, 0.0, 0.0), 0.0, 1e6
+    return env

@@ -1,0 +1,122 @@
+"""The page's program without a browser: the loop, recordings, the port, the command line."""
+
+from __future__ import annotations
+
+import socket
+
+import numpy as np
+import pytest
+
+from cotap.evaluation.recording import load_recording
+from cotap.play.__main__ import main
+from cotap.play.app import App
+from cotap.play.controls import Refused
+from cotap.play.forces import Push
+from cotap.play.mailbox import Record, Reset, Step
+from cotap.play.plots import Plots, force_displacement
+from cotap.play.server import PortTaken, open_server
+
+
+@pytest.fixture
+def app(session, free_port, tmp_path):
+    server = open_server("127.0.0.1", free_port)
+    yield App(server, session, tmp_path / "out")
+    server.stop()
+
+
+def test_mail_reaches_the_simulation_and_bad_mail_does_not(app):
+    app.mailbox.set("a.left.stiffness_x", 700.0)
+    for value in (float("nan"), "soft", None):
+        with pytest.raises(Refused):
+            app.mailbox.set("a.left.stiffness_x", value)
+    app.mailbox.set("a.right.stiffness_x", 1e12)
+    app.advance()
+    stiffness = app.session.env.upper_body.parameters.stiffness[0, :, 0]
+    assert stiffness.tolist() == [700.0, 1500.0]
+
+
+def test_the_page_shows_what_was_accepted_not_what_was_sent(app):
+    alpha = app.panel._handles["a.left.alpha"]
+    for sent, shown in ((0.25, 0.25), (float("nan"), 0.25), (7.0, 1.0)):
+        alpha._impl.value = sent  # as a browser's message does
+        app.panel._set("a.left.alpha", sent, None)
+        if sent != shown:
+            assert alpha.value == shown
+    app.advance()
+    assert float(app.session.env.upper_body.parameters.alpha[0, 0]) == 1.0
+
+
+def test_paused_it_stands_still_but_for_single_steps_and_reset_starts_over(app):
+    app.advance()
+    app.mailbox.set("paused", True)
+    app.advance()
+    before = app.session.num_steps
+    app.advance()
+    app.mailbox.ask(Step())
+    app.advance()
+    app.advance()
+    assert app.session.num_steps == before + 1
+    app.mailbox.ask(Reset())
+    app.advance()
+    assert int(app.session.env.episode_length_buf[0]) == 0
+
+
+def test_a_recording_holds_what_was_shown_and_a_change_of_robots_ends_it(app):
+    app.mailbox.ask(Record(True))
+    for step in range(30):
+        if step == 10:
+            app.mailbox.ask(Push("right", (0.0, 0.0, -30.0), 0.2))
+        app.advance()
+    app.mailbox.set("side_by_side", True)
+    app.advance()
+    recording = load_recording(app.archive.path)
+    assert recording.trajectory.fell.shape == (30, 1)
+    loaded = np.abs(recording.scene["hand_force_w"][:, 0, 1]).max(1) > 1.0
+    assert loaded.nonzero()[0].tolist() == list(range(10, 20))
+    app.mailbox.ask(Record(True))
+    app.advance()
+    app.mailbox.ask(Record(False))
+    app.advance()
+    assert app.archive.path.name == "recording_002.npz"
+
+
+def test_a_checkpoint_that_is_refused_is_shown_as_it_was(app):
+    app.mailbox.set("a.checkpoint", "missing")
+    app.advance()
+    assert app.panel._handles["a.checkpoint"].value == "base"
+
+
+def test_a_simulation_that_fails_ends_the_program_and_says_why(app, monkeypatch):
+    monkeypatch.setattr(app.session, "step", lambda: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        app.run()
+
+
+def test_the_plot_of_force_over_displacement_takes_loaded_steps_along_the_force(session):
+    sample = session.step()
+    loaded = {k: v.copy() for k, v in sample.items()}
+    loaded["hand_force_w"][0, 0] = (0.0, 0.0, -20.0)
+    loaded["hand_w"][0, 0] = loaded["hand_reference_w"][0, 0] + np.array([0.01, 0.0, -0.05])
+    force, along = force_displacement([sample, loaded], 0, 0)
+    assert force.tolist() == [20.0]
+    assert along == pytest.approx([50.0], rel=1e-4)
+    assert len(Plots.TITLES) == 5
+
+
+def test_a_taken_port_is_told_with_what_to_do(free_port, capsys):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", free_port))
+        taken.listen()
+        with pytest.raises(PortTaken, match=f"--port {free_port + 1}"):
+            open_server("127.0.0.1", free_port)
+        assert main(["--port", str(free_port)]) == 2
+    assert "another cotap.play" in capsys.readouterr().err
+
+
+def test_what_cannot_be_shown_is_refused_before_anything_runs(free_port, tmp_path, capsys):
+    assert main(["--port", "0"]) == 2
+    assert main(["--port", str(free_port), "--replay", str(tmp_path / "none.npz")]) == 2
+    assert main(["--port", str(free_port), "--checkpoint", str(tmp_path / "none.pt")]) == 2
+    err = capsys.readouterr().err
+    assert "none.npz" in err
+    assert "none.pt" in err
