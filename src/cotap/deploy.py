@@ -15,7 +15,7 @@ from cotap.checks import require_positive_int
 from cotap.deployment.engines import EngineConfig
 from cotap.deployment.robot import Perturbations
 from cotap.deployment.safety import SafetyConfig
-from cotap.deployment.scenario import Scenario, load_scenario
+from cotap.deployment.scenario import Scenario, TimedCommand, load_scenario
 from cotap.evaluation.law_options import parse_law
 
 
@@ -96,6 +96,8 @@ def deploy(options: DeployOptions) -> dict[str, Any]:
             setattr(laws, side, parse_law(side, text, replace(laws.of(side))))
     laws.check()
     pilot = KeyboardPilot(spec.nominal_height_m) if options.keyboard else None
+    if pilot:
+        scenario.command = (TimedCommand(stand=True),)
     started = time.perf_counter()
     with raw_terminal() if options.keyboard else nullcontext():
         if options.keyboard:

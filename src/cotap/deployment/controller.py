@@ -111,6 +111,11 @@ class Controller:
         self._chains, self._shape = arm_chains(spec, torch.float64), (len(spec.arms), len(spec.arms[0].joints))
         self._action = np.zeros(len(spec.joints))
         self._started = False
+
+    def restart(self) -> None:
+        """Begin anew, with a fresh history: at the command that was given, or a random one, from rest."""
+        self._started, self._action = False, np.zeros_like(self._action)
+        self.upper_body.reset(self._everyone, self._rng)
         self.commands.reset(self._everyone, self._rng)
         self.motion.reset(self._everyone, self._rng)
 

@@ -54,7 +54,6 @@ class KeyboardPilot:
         """As `cotap.deployment.trial.Pilot`."""
         if time_s == 0.0:
             self._start = time.perf_counter()
-            self._stick.press(" ").give(controller.commands, self._nominal)
         for key in _pressed():
             command = self._stick.press(key)
             command.give(controller.commands, self._nominal)

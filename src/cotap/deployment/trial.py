@@ -43,6 +43,7 @@ class Trial:
 
 def start_up(robot: Robot, controller: Controller, safety: SafetyConfig, seed: int) -> None:
     """Bring the robot to its first pose with rising gains while its base is held, and let it go."""
+    controller.restart()
     default = np.array([j.default_rad for j in robot.spec.joints])
     pose = np.concatenate((default[: len(robot.spec.lower_joints)], controller.initial_arms))
     robot.start(pose, seed)
@@ -63,11 +64,13 @@ def run_trial(
     pilot: Pilot | None = None,
 ) -> Trial:  # fmt: skip
     """Start the robot up and run the scenario until its end, a fall, or a stop and what follows it."""
+    commands, dt, trial = list(scenario.command), controller.dt, Trial(controller.dt)
+    if commands and commands[0].at == 0.0:  # the robot begins with it, it need not change over
+        commands[0].give(controller.commands, robot.spec.nominal_height_m)
     start_up(robot, controller, safety, seed)
-    dt, trial = controller.dt, Trial(controller.dt)
     watchdog = Watchdog(safety, robot.spec.joint_names, robot.torque_limit, dt)
     forces, falling = scenario.forces(robot.spec), TerminationConfig()
-    commands, left = list(scenario.command), math.inf
+    left = math.inf
     for k in range(round(scenario.seconds / dt)):
         while commands and commands[0].at <= k * dt + 1e-9:
             commands.pop(0).give(controller.commands, robot.spec.nominal_height_m)
@@ -85,7 +88,8 @@ def run_trial(
             (f.at(torch.tensor([k * dt]))[0].double().numpy() for f in forces), np.zeros((len(robot.spec.arms), 3))
         )
         robot.act(law, push, at_once=bool(trial.stopped))
-        if bool(diverged(*(torch.from_numpy(x).unsqueeze(0) for x in (robot.engine.qpos, robot.engine.qvel)))):
+        qpos, qvel = (torch.from_numpy(x).unsqueeze(0) for x in (robot.engine.qpos, robot.engine.qvel))
+        if diverged(qpos, qvel).any():
             trial.fell, trial.stopped = True, trial.stopped or "the simulation diverged"
             break
         truth = robot.truth()
