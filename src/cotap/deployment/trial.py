@@ -22,7 +22,7 @@ from cotap.evaluation.rollout import Trajectory
 Pilot = Callable[[Controller, float], bool]
 """Called at every control step with the time [s]: may change commands, and says whether to go on."""
 STOP_S = 1.0
-"""How long a stopped robot is recorded [s]."""
+"""How long a robot that fell or stopped itself is recorded [s]."""
 
 
 @dataclass
@@ -81,7 +81,7 @@ def run_trial(
         if not trial.stopped:
             trial.stopped = watchdog.reason(readings, law)
             if trial.stopped:
-                trial.stopped_at_s, left = k * dt, round(STOP_S / dt)
+                trial.stopped_at_s = k * dt
         if trial.stopped:
             law = damped_law(robot.damping)
         push = sum(
@@ -97,8 +97,9 @@ def run_trial(
         trial.fell = trial.fell or down or bool(trial.stopped)
         trial.rows.append(_row(robot, controller, truth, controller.commands.current(), trial.fell))
         trial.qpos.append(robot.engine.qpos.copy())
-        left -= 1
-        if left <= 0 or (down and not trial.stopped):
+        if trial.fell:
+            left = min(left, round(STOP_S / dt)) - 1
+        if left <= 0:
             break
     return trial
 
