@@ -33,7 +33,7 @@ def stand(env: H1Env, gains: torch.Tensor, offset_m: float, seconds: float) -> t
     height = torch.full((n,), env.spec.nominal_height_m + offset_m)
     env.commands.override(torch.zeros(n, 2), torch.zeros(n), torch.ones(n), height)
     env.reset()
-    env.stance_balance.set_gains(gains, 0 if offset_m == 0.0 else 1)
+    env.joint_targets.stance.set_gains(gains, 0 if offset_m == 0.0 else 1)
     score, standing = torch.zeros(n), torch.ones(n)
     steps = round(seconds / env.dt)
     for _ in range(steps):

@@ -180,3 +180,6 @@ LAWS: dict[str, Callable[[Arms, LawConfig], UpperBodyLaw]] = {
 
 WITHOUT_STIFFNESS = ("pd", "soft-pd")
 """Laws that command no stiffness of the hand."""
+
+SENSING_FORCE = ("facet", "cotap+facet", "cotap+facet-matched", "dcc")
+"""Laws that move the hand's target by the force on it, and so must know that force."""

@@ -13,17 +13,19 @@ from tensordict import TensorDict
 from cotap.checks import require_all_finite, require_one_of, require_positive_int, require_range, require_shape
 from cotap.compliance.kinematics import ChainPose
 from cotap.compliance.laws import LawConfig
+from cotap.envs.actions import ActionConfig, JointTargets
 from cotap.envs.blows import BlowConfig, Blows
 from cotap.envs.commands import CommandConfig, CommandSource, leaning
 from cotap.envs.disturbances import Assistance, AssistConfig, HandForceConfig, HandForces, assist_wrench
 from cotap.envs.forces import ForceProfile, ScriptedForces
-from cotap.envs.gait import StepMotion, desired_contact, swing_progress
+from cotap.envs.gait import desired_contact, swing_progress
 from cotap.envs.impedance import ImpedanceConfig, PathFollower
 from cotap.envs.observations import (
     GOALS_PER_ARM,
     ObservationConfig,
     ObservationHistory,
     actor_terms,
+    actor_values,
     critic_terms,
     noise_amplitude,
 )
@@ -32,7 +34,6 @@ from cotap.envs.punches import PunchConfig, Punches
 from cotap.envs.randomization import RandomizationConfig, Randomizer
 from cotap.envs.reference import ReferenceConfig, ReferenceMotion
 from cotap.envs.rewards import LowerRewards, RewardGroup, StepRecord, UpperRewards, check_weights
-from cotap.envs.stance import StanceBalance
 from cotap.envs.state import RobotState, StateReader
 from cotap.envs.symmetry import actor_reflection, critic_reflection, joint_reflection
 from cotap.envs.terminations import TerminationConfig, diverged, fallen
@@ -45,42 +46,6 @@ from cotap.rotations import quat_about_z, quat_from_matrix, rotate
 from cotap.sim import DelayedTargets, Simulation, Snapshot
 
 GRAVITY = 9.81
-
-
-@dataclass
-class ActionConfig:
-    """How actions become joint targets."""
-
-    lower_scale: float = 0.25
-    """Radians per unit of lower action, added to the default pose."""
-    twist_scale: float = 0.1
-    """The same of the joints that turn about the vertical, hip yaw and waist: less, so that exploring shakes less."""
-    step_lift: float = 1.0
-    """Share of the swinging foot's lift that the gait clock feeds forward to the legs; 0 leaves it to the policy."""
-    step_stride: float = 1.0
-    """Share of the feet's sweep at the commanded velocity that is fed forward; 0 leaves it to the policy."""
-    stance_balance: float = 1.0
-    """Share of the standing pose and the feedback that balances it that are fed forward; 0 leaves it to the policy."""
-    upper_scale: float = 0.1
-    """Radians per unit of upper action, added to the reference (residual) or to the default pose (absolute)."""
-    reference_lead_s: float = 0.03
-    """How far ahead of the arms' reference their targets run [s]: what damping and delay hold back."""
-    upper_mode: str = "residual"
-    """residual (FALCON) or absolute (the paper)."""
-    clip: float = 20.0
-    """Largest magnitude of an action."""
-
-    def check(self) -> None:
-        """Raise ValueError naming the first field that is out of its range."""
-        require_range("actions.lower_scale", self.lower_scale, 0.0, 10.0)
-        require_range("actions.step_lift", self.step_lift, 0.0, 2.0)
-        require_range("actions.step_stride", self.step_stride, 0.0, 2.0)
-        require_range("actions.stance_balance", self.stance_balance, 0.0, 2.0)
-        require_range("actions.twist_scale", self.twist_scale, 0.0, 10.0)
-        require_range("actions.upper_scale", self.upper_scale, 0.0, 10.0)
-        require_range("actions.reference_lead_s", self.reference_lead_s, 0.0, 1.0)
-        require_range("actions.clip", self.clip, 1e-3, 1e6)
-        require_one_of("actions.upper_mode", self.upper_mode, ("residual", "absolute"))
 
 
 @dataclass
@@ -193,13 +158,7 @@ class H1Env(VecEnv):
         self._sideways = tuple(
             i for i, j in enumerate(joints[: self.num_lower]) if j.mirror_sign < 0.0
         )  # yaw and roll joints
-        self._step_motion = StepMotion(
-            spec, model, cfg.commands.gait_period_s, cfg.actions.step_lift, cfg.actions.step_stride
-        )
-        self.stance_balance = StanceBalance(spec, model)
-        self._action_scale = torch.full((self.num_actions,), cfg.actions.lower_scale)
-        self._action_scale[[j.axis == (0.0, 0.0, 1.0) for j in joints]] = cfg.actions.twist_scale
-        self._action_scale[self.num_lower :] = cfg.actions.upper_scale
+        self.joint_targets = JointTargets(cfg.actions, spec, model, cfg.commands.gait_period_s)
 
         self.reader = StateReader(spec, self.sim)
         self.arm_limits = self.reader.arm_joints(self._torque_limit.unsqueeze(0))[0]
@@ -369,22 +328,11 @@ class H1Env(VecEnv):
 
     def target_from_action(self, action: torch.Tensor) -> torch.Tensor:
         """Joint targets (N, J) [rad] of actions (N, J), for the present command, gait phase and arm reference."""
-        target = self._default + self._action_scale * action
-        c = self.commands.current()
-        step = self._step_motion(c.phase, c.velocity_h, c.yaw_rate)
-        target[:, self._step_motion.joints] += (1.0 - c.stand)[:, None, None] * step
-        s, legs = self.state, self.stance_balance.joints
-        stance = self.stance_balance(
-            c.height, s.joint_pos, s.joint_vel, s.projected_gravity_t, s.torso_angular_velocity_t
-        )
-        share = self.cfg.actions.stance_balance * c.stand[:, None, None]
-        target[:, legs] += share * (stance.unsqueeze(1) - self._default[legs])
-        if self.cfg.actions.upper_mode == "residual":
-            upper = slice(self.num_lower, None)
-            reference = self.motions.current()
-            lead = self.cfg.actions.reference_lead_s * reference.velocity
-            target[:, upper] += reference.position + lead - self._default[upper]
-        return target
+        s, reference = self.state, self.motions.current()
+        return self.joint_targets(
+            action, self.commands.current(), s.joint_pos, s.joint_vel, s.projected_gravity_t,
+            s.torso_angular_velocity_t, reference.position + self.cfg.actions.reference_lead_s * reference.velocity,
+        )  # fmt: skip
 
     def set_law(self, world: int, arm: int, law: LawConfig) -> None:
         """Put one arm of one world under another law, from the next step on. Raises ValueError as `law.check` does."""
@@ -677,22 +625,14 @@ class H1Env(VecEnv):
 
     def _observe(self, restarted: torch.Tensor) -> None:
         """Append the present to the history of every world and assemble the observation groups."""
-        s, c = self.state, self.commands.current()
-        angle, walking = 2.0 * math.pi * c.phase, 1.0 - c.stand
+        s, seen = self.state, self.cfg.observations
         torque = self.joint_torque(s)[:, self.num_lower :]
-        actor_sees = self.cfg.observations.arm_torque == "actor"
-        present = torch.cat(
-            (
-                s.torso_angular_velocity_t, s.projected_gravity_t, c.velocity_h, c.yaw_rate.unsqueeze(1),
-                c.stand.unsqueeze(1), c.height.unsqueeze(1), self.motions.current().position,
-                s.joint_pos - self._default, s.joint_vel, self._last_action,
-                (walking * angle.sin()).unsqueeze(1), (walking * angle.cos()).unsqueeze(1),
-                *((torque,) if actor_sees else ()), *((self._goals(),) if self.cfg.observations.goals else ()),
-            ),
-            1,
-        )  # fmt: skip
-        present = present * self.history.scale
-        groups = {"privileged": self._privileged(s, None if actor_sees else torque) * self._critic_scale}
+        values = actor_values(
+            s, self.commands.current(), self.motions.current().position, self._default, self._last_action, torque
+        )
+        present = self.history.scaled(values | ({"goals": self._goals()} if seen.goals else {}))
+        unseen = None if seen.arm_torque == "actor" else torque
+        groups = {"privileged": self._privileged(s, unseen) * self._critic_scale}
         if self.cfg.observations.noise.enabled:
             groups["clean"] = self._clean_history.append(present, restarted)
             present = present + self._noise * uniform(self.rng, -1.0, 1.0, *present.shape)

@@ -31,9 +31,9 @@ class HandSensors(Stateful):
     def __init__(self, arms: Arms, num_envs: int, dt: float, estimates: bool) -> None:
         self._arms, self._dt, self.estimates = arms, dt, estimates
         num_arms, joints = arms.kp.shape
-        self.privileged = torch.zeros(num_envs, num_arms, 3)
-        self.estimated = torch.zeros(num_envs, num_arms, 3)
-        self._momentum, self._torque = (torch.zeros(num_envs, num_arms, joints) for _ in range(2))
+        self.privileged = torch.zeros(num_envs, num_arms, 3, dtype=arms.kp.dtype)
+        self.estimated = torch.zeros(num_envs, num_arms, 3, dtype=arms.kp.dtype)
+        self._momentum, self._torque = (torch.zeros(num_envs, num_arms, joints, dtype=arms.kp.dtype) for _ in range(2))
 
     def reset(self, mask: torch.Tensor) -> None:
         """Arms in the worlds of `mask` start at rest, with nothing on their hands."""

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import torch
 
 from cotap.checks import require_one_of, require_range
+from cotap.envs.commands import Command
 from cotap.envs.persistence import Stateful
+from cotap.envs.state import RobotState
 
 
 @dataclass
@@ -87,6 +91,38 @@ def critic_terms(num_hands: int, num_torques: int = 0) -> tuple[Term, ...]:
     )
 
 
+def actor_values(
+    s: RobotState, command: Command, arm_reference: torch.Tensor, default: torch.Tensor, last_action: torch.Tensor,
+    arm_torque: torch.Tensor,
+) -> dict[str, torch.Tensor]:  # fmt: skip
+    """What actors observe, by term, unscaled.
+
+    Args:
+        s: What the robot's sensors say; of it, only joints, gravity's direction and angular velocity are used.
+        command: What is commanded, and the gait's phase.
+        arm_reference: (N, U) reference arm position [rad].
+        default: (J,) the default pose [rad].
+        last_action: (N, J).
+        arm_torque: (N, U) [Nm].
+    """
+    angle, walking = 2.0 * math.pi * command.phase, 1.0 - command.stand
+    return {
+        "torso_angular_velocity": s.torso_angular_velocity_t,
+        "projected_gravity": s.projected_gravity_t,
+        "command_velocity": command.velocity_h,
+        "command_yaw_rate": command.yaw_rate.unsqueeze(1),
+        "command_stand": command.stand.unsqueeze(1),
+        "command_height": command.height.unsqueeze(1),
+        "reference_arm_position": arm_reference,
+        "joint_position": s.joint_pos - default,
+        "joint_velocity": s.joint_vel,
+        "last_action": last_action,
+        "sin_phase": (walking * angle.sin()).unsqueeze(1),
+        "cos_phase": (walking * angle.cos()).unsqueeze(1),
+        "arm_torque": arm_torque,
+    }
+
+
 class ObservationHistory(Stateful):
     """Keeps the last steps of every term, laid out term by term and oldest first."""
 
@@ -98,6 +134,10 @@ class ObservationHistory(Stateful):
         self.scale = torch.cat([torch.full((width,), scale) for _, width, scale in terms])
         self.buffer = torch.zeros(num_envs, self.width * steps)
         self._widths = [width for _, width, _ in terms]
+
+    def scaled(self, values: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        """One step (N, width): `values` (N, width of each) in the terms' order, by the terms' scales."""
+        return torch.cat([values[name] for name, _, _ in self.terms], 1) * self.scale
 
     def append(self, present: torch.Tensor, restarted: torch.Tensor) -> torch.Tensor:
         """Add `present` (N, width), already scaled; worlds in `restarted` (N,) fill their history with it.

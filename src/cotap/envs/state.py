@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 
@@ -10,7 +11,6 @@ from cotap.compliance.kinematics import ChainPose
 from cotap.robots import RobotSpec
 from cotap.robots.chains import arm_chains, chains_between
 from cotap.rotations import heading_matrix, matrix_from_quat, rotate, rotate_inverse
-from cotap.sim import Simulation
 
 CONTACT_FORCE_N = 5.0
 """A foot that carries more than this is in contact."""
@@ -68,20 +68,38 @@ class RobotState:
         return self.torso_pos_w[:, 2]
 
 
-class StateReader:
-    """Turns a simulation's raw vectors into a `RobotState`."""
+class StateSource(Protocol):
+    """Where raw vectors come from: a batched simulation, or one robot as a batch of one."""
 
-    def __init__(self, spec: RobotSpec, sim: Simulation) -> None:
-        self._sim = sim
-        self.arm_chains = arm_chains(spec)
-        self._waist = chains_between(spec, spec.base_body, [(spec.torso_body, (0.0, 0.0, 0.0))])
+    @property
+    def qpos(self) -> torch.Tensor:
+        """(N, 7 + J) base position [m], base quaternion, joint angles [rad]."""
+        ...
+
+    @property
+    def qvel(self) -> torch.Tensor:
+        """(N, 6 + J) base velocity in the world [m/s], base rates in its frame [rad/s], joint rates [rad/s]."""
+        ...
+
+    def sensor(self, name: str) -> torch.Tensor:
+        """Live (N, dim) view of a named sensor."""
+        ...
+
+
+class StateReader:
+    """Turns a simulation's raw vectors into a `RobotState` of tensors of `dtype`."""
+
+    def __init__(self, spec: RobotSpec, source: StateSource, dtype: torch.dtype = torch.float32) -> None:
+        self._source, self._dtype = source, dtype
+        self.arm_chains = arm_chains(spec, dtype)
+        self._waist = chains_between(spec, spec.base_body, [(spec.torso_body, (0.0, 0.0, 0.0))], dtype)
         waist = [b.joint or "" for b in spec.chain(spec.torso_body, spec.base_body)]
         self._waist_ids = spec.indices(waist)
         self._arm_ids = torch.tensor(spec.indices(spec.upper_joints))
         self._num_arms = len(spec.arms)
         names = [f"{foot.side}_foot" for foot in spec.feet]
-        self._foot_sensors = {k: [sim.sensor(f"{n}_{k}") for n in names] for k in ("pos", "vel", "up", "forward")}
-        self._touch = [sim.sensor(f"{n}_touch") for n in names]
+        self._foot_sensors = {k: [source.sensor(f"{n}_{k}") for n in names] for k in ("pos", "vel", "up", "forward")}
+        self._touch = [source.sensor(f"{n}_touch") for n in names]
 
     def arm_joints(self, values: torch.Tensor) -> torch.Tensor:
         """Pick the arms out of (N, J): (N, arms, joints per arm)."""
@@ -89,7 +107,7 @@ class StateReader:
 
     def read(self) -> RobotState:
         """The state now."""
-        qpos, qvel = self._sim.qpos.float(), self._sim.qvel.float()
+        qpos, qvel = self._source.qpos.to(self._dtype), self._source.qvel.to(self._dtype)
         q, dq = qpos[:, 7:], qvel[:, 6:]
         base = matrix_from_quat(torch.nn.functional.normalize(qpos[:, 3:7], dim=-1))
         waist = self._waist.pose(q[:, None, self._waist_ids])

@@ -99,10 +99,12 @@ class UpperBody(Stateful):
 
     STATE = ("fresh", "_hold_s", "_anchor", "_feedforward", "_elastic", "_stiffness", "_damping")
 
-    def __init__(self, cfg: UpperBodyConfig, spec: RobotSpec, num_envs: int, dt: float) -> None:
+    def __init__(
+        self, cfg: UpperBodyConfig, spec: RobotSpec, num_envs: int, dt: float, dtype: torch.dtype = torch.float32
+    ) -> None:
         cfg.check()
         self._cfg, self._spec, self._dt = cfg, spec, dt
-        self.arms = arm_model(spec)
+        self.arms = arm_model(spec, dtype)
         configs = [cfg.of(arm.side) for arm in spec.arms]
         self.sensors = HandSensors(self.arms, num_envs, dt, any(c.sensing == "estimated" for c in configs))
         n, a, j = num_envs, len(configs), len(spec.arms[0].joints)
@@ -111,16 +113,16 @@ class UpperBody(Stateful):
         for i, c in enumerate(configs):
             self._mask(c)[:, i] = True
         self.parameters = LawParameters(
-            torch.tensor([c.stiffness for c in configs]).repeat(n, 1, 1),
-            torch.tensor([c.null_stiffness for c in configs]).repeat(n, 1),
-            torch.tensor([c.alpha for c in configs]).repeat(n, 1),
+            torch.tensor([c.stiffness for c in configs], dtype=dtype).repeat(n, 1, 1),
+            torch.tensor([c.null_stiffness for c in configs], dtype=dtype).repeat(n, 1),
+            torch.tensor([c.alpha for c in configs], dtype=dtype).repeat(n, 1),
         )
         self.fresh = torch.ones(n, dtype=torch.bool)
         # Two torque laws, the one in force and the one before it: (2, N, A, n[, n]).
-        self._anchor, self._feedforward, self._elastic = (torch.zeros(2, n, a, j) for _ in range(3))
-        self._stiffness, self._damping = (torch.zeros(2, n, a, j, j) for _ in range(2))
+        self._anchor, self._feedforward, self._elastic = (torch.zeros(2, n, a, j, dtype=dtype) for _ in range(3))
+        self._stiffness, self._damping = (torch.zeros(2, n, a, j, j, dtype=dtype) for _ in range(2))
         self._hold_s = torch.zeros(n)
-        self._torso = _TorsoModel(cfg.torso, spec)
+        self._torso = _TorsoModel(cfg.torso, spec, dtype)
         self.log: dict[str, torch.Tensor] = {}
         """Means over worlds and arms of what the laws report about the last step."""
 
@@ -223,6 +225,11 @@ class UpperBody(Stateful):
             return new.flatten(1)
         return torch.lerp(self._law(0).at(*state), new, arrived[:, None, None]).flatten(1)
 
+    @property
+    def newest(self) -> TorqueLaw:
+        """What the laws answered last."""
+        return self._law(1)
+
     def implicit_gains(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Diagonals (N, U) of stiffness and damping in force, which the simulator may integrate implicitly."""
         diagonals = (torch.diagonal(m[1], dim1=-2, dim2=-1).flatten(1) for m in (self._stiffness, self._damping))
@@ -310,19 +317,19 @@ def _choose(mine: torch.Tensor, answer: TorqueLaw, other: TorqueLaw) -> TorqueLa
 class _TorsoModel:
     """The hands' compliance through the torso, in the heading frame."""
 
-    def __init__(self, cfg: TorsoComplianceConfig, spec: RobotSpec) -> None:
+    def __init__(self, cfg: TorsoComplianceConfig, spec: RobotSpec, dtype: torch.dtype) -> None:
         self._cfg = cfg
         gains = {j.name: j.kp for j in spec.joints}
-        self._constant = torch.diag(1.0 / torch.tensor(cfg.stiffness))
+        self._constant = torch.diag(1.0 / torch.tensor(cfg.stiffness, dtype=dtype))
         chains = [spec.chain(foot.body, spec.base_body) for foot in spec.feet]
         names = [[b.joint or "" for b in chain] for chain in chains]
-        self._legs = chains_between(spec, spec.base_body, [(f.body, f.sole) for f in spec.feet])
+        self._legs = chains_between(spec, spec.base_body, [(f.body, f.sole) for f in spec.feet], dtype)
         self._leg_joints = torch.tensor([spec.indices(chain) for chain in names])
-        self._leg_gains = torch.tensor([[gains[n] for n in chain] for chain in names])
+        self._leg_gains = torch.tensor([[gains[n] for n in chain] for chain in names], dtype=dtype)
         waist = [b.joint or "" for b in spec.chain(spec.torso_body, spec.base_body)]
-        self._waist = chains_between(spec, spec.base_body, [(spec.torso_body, (0.0, 0.0, 0.0))])
+        self._waist = chains_between(spec, spec.base_body, [(spec.torso_body, (0.0, 0.0, 0.0))], dtype)
         self._waist_joints = torch.tensor([spec.indices(waist)])
-        self._waist_gains = torch.tensor([[gains[n] for n in waist]])
+        self._waist_gains = torch.tensor([[gains[n] for n in waist]], dtype=dtype)
 
     def hand_compliance(self, s: RobotState, to_heading: torch.Tensor) -> torch.Tensor | None:
         """(N, A, 3, 3) [m/N], or None where stiffness is against the torso."""

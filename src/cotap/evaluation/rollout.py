@@ -11,7 +11,9 @@ from tqdm import tqdm
 
 from cotap.agents.actors import as_dict
 from cotap.compliance.dynamics import gravity_torque
+from cotap.compliance.interface import Arms
 from cotap.envs import H1Env
+from cotap.envs.state import RobotState
 from cotap.rotations import rotate_inverse
 
 PolicyFunction = Callable[[dict[str, torch.Tensor]], torch.Tensor]
@@ -118,12 +120,11 @@ def idle(env: H1Env) -> PolicyFunction:
     return lambda _: torch.zeros(env.num_envs, env.num_actions)
 
 
-def arm_static_torque(env: H1Env) -> torch.Tensor:
-    """Torque (N, U) [Nm] that holds the arms still under gravity and the forces that acted in the last step."""
-    s = env.record.state
-    held = gravity_torque(env.upper_body.arms.inertias, s.arms, s.torso_rotation_w[:, 2])
-    force_t = rotate_inverse(s.torso_rotation_w.unsqueeze(1), env.hand_force_w)
-    return (held - rotate_inverse(env.reader.arm_chains.jacobian(s.arms), force_t)).flatten(1)
+def arm_static_torque(arms: Arms, s: RobotState, force_w: torch.Tensor) -> torch.Tensor:
+    """Torque (N, U) [Nm] that holds the arms still under gravity and forces (N, A, 3) on the hands, world frame [N]."""
+    held = gravity_torque(arms.inertias, s.arms, s.torso_rotation_w[:, 2])
+    force_t = rotate_inverse(s.torso_rotation_w.unsqueeze(1), force_w)
+    return (held - rotate_inverse(arms.chains.jacobian(s.arms), force_t)).flatten(1)
 
 
 def trajectory_row(env: H1Env, fell: torch.Tensor) -> dict[str, torch.Tensor]:
@@ -143,7 +144,7 @@ def trajectory_row(env: H1Env, fell: torch.Tensor) -> dict[str, torch.Tensor]:
         "arm_velocity": s.joint_vel[:, upper],
         "arm_torque": r.torque[:, upper],
         "arm_at_limit": (r.torque[:, upper].abs() > 0.999 * env.arm_limits.flatten()).any(1),
-        "arm_static_torque": arm_static_torque(env),
+        "arm_static_torque": arm_static_torque(env.upper_body.arms, s, env.hand_force_w),
         "hand_offset": offset_t @ (s.heading_w.transpose(1, 2) @ s.torso_rotation_w).transpose(1, 2),
         "hand_error": offset_t.norm(dim=2),
         "foot_contact": s.foot_contact,

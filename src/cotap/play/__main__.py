@@ -71,13 +71,14 @@ def _run(options: PlayOptions) -> int:
 def _live(options: PlayOptions, server: ViserServer) -> App:
     import torch
 
-    from cotap.evaluation.policy import SHIPPED, shipped_checkpoint
+    from cotap.evaluation.policy import shipped_checkpoint, shipped_names
     from cotap.play.app import App
     from cotap.play.session import Session
 
     torch.set_num_threads(1)  # two robots: more would only wait for each other
     checkpoints = {path: Path(path) for path in options.checkpoint}
-    checkpoints |= {f"shipped {stage}": shipped_checkpoint(stage) for stage in SHIPPED}
+    names = sorted(shipped_names(), key=lambda name: name != "cotap")  # the first is what the page begins with
+    checkpoints |= {f"shipped {name}": shipped_checkpoint(name) for name in names}
     return App(server, Session(checkpoints, options.seed), Path(options.output))
 
 

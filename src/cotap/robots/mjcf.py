@@ -47,7 +47,7 @@ def build_model(
     if unevenness_m > 0.0:
         _add_bumps(mj, unevenness_m)
     if fixed_base:
-        _hold_base(mj, spec)
+        hold_base(mj, spec)
     return mj.compile()
 
 
@@ -78,7 +78,7 @@ def build_mjspec(spec: RobotSpec, collision: str = "feet", timestep_s: float = 0
     return mj
 
 
-def _hold_base(mj: mujoco.MjSpec, spec: RobotSpec) -> None:
+def hold_base(mj: mujoco.MjSpec, spec: RobotSpec) -> None:
     """Weld the base to the world; stiffly, since what hangs from it is measured to a tenth of a millimetre."""
     weld = mj.add_equality(name="fixed_base", type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY)
     weld.name1, weld.name2 = spec.base_body, "world"

@@ -1,0 +1,55 @@
+"""One ONNX policy in several physics engines: Markdown, JSON and a picture."""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import tyro
+
+from cotap.agents.checkpoint import write_atomically, write_json
+from cotap.deployment.controller import robot_of
+from cotap.deployment.engines import make_engine
+from cotap.deployment.policy import OnnxPolicy
+from cotap.deployment.sim_to_sim import Comparison, compare, figure, markdown
+
+
+@dataclass
+class Options:
+    """Velocity tracking, impact, constant and periodic load in every engine; perturbations in the first."""
+
+    policy: str
+    """What `python -m cotap.export` wrote."""
+    output: str = "runs/sim_to_sim"
+    """Folder for report.md, report.json and report.png."""
+    comparison: tyro.conf.OmitArgPrefixes[Comparison] = field(default_factory=Comparison)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Parse, run, write. Returns the exit status: 0, or 2 for bad input."""
+    options = tyro.cli(Options, args=argv, prog="scripts/sim_to_sim.py")
+    cfg = options.comparison
+    try:
+        policy = OnnxPolicy(options.policy)
+        cfg.check()
+        for name in cfg.engines:  # before hours are spent on the others
+            make_engine(cfg.engine(name), robot_of(policy.metadata)).close()
+        started = time.perf_counter()
+        result = compare(policy, cfg)
+        result["seconds"] = time.perf_counter() - started
+        output = Path(options.output)
+        output.mkdir(parents=True, exist_ok=True)
+        write_json(output / "report.json", result)
+        write_atomically(output / "report.md", lambda p: p.write_text(markdown(result), encoding="utf-8"))
+        write_atomically(output / "report.png", lambda p: figure(result, p))
+    except (ValueError, OSError, ModuleNotFoundError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print(markdown(result))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,143 @@
+"""`python -m cotap.deploy`: one robot, its policy in onnxruntime, in a physics engine of choice."""
+
+from __future__ import annotations
+
+import sys
+import time
+from contextlib import nullcontext
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from cotap.checks import require_positive_int
+from cotap.deployment.engines import EngineConfig
+from cotap.deployment.robot import Perturbations
+from cotap.deployment.safety import SafetyConfig
+from cotap.deployment.scenario import Scenario, TimedCommand, load_scenario
+from cotap.evaluation.law_options import parse_law
+
+
+@dataclass
+class DeployOptions:
+    """One robot as it would run on hardware: joint and IMU readings in, torque laws out.
+
+    Commands come from a scenario, from the keyboard, or are drawn at random as the velocity-tracking evaluation does.
+    """
+
+    policy: str
+    """What `python -m cotap.export` wrote."""
+    scenario: str = ""
+    """Commands, forces, arm motion and laws over time (TOML)."""
+    keyboard: bool = False
+    """Commands from this terminal, in real time."""
+    trials: int = 1
+    """Repeat so often, with other seeds, and sum up."""
+    seconds: float = 20.0
+    """How long a trial lasts; a scenario says so itself [s]."""
+    arm_motion: str = ""
+    """Clip that the arms follow, or `random`; empty holds the default pose. A scenario says so itself."""
+    left: str = ""
+    """The left arm's law, such as cotap:alpha=0.7,stiffness=500; by default the scenario's, or that of training."""
+    right: str = ""
+    """The right arm's law."""
+    seed: int = 0
+    """Seed of commands, motions and perturbations."""
+    json: str = ""
+    """Write the result here."""
+    video: str = ""
+    """Write a video of the first trial here (MP4)."""
+    engine: tyro.conf.OmitArgPrefixes[EngineConfig] = field(default_factory=EngineConfig)
+    perturbations: tyro.conf.OmitArgPrefixes[Perturbations] = field(default_factory=Perturbations)
+    safety: tyro.conf.OmitArgPrefixes[SafetyConfig] = field(default_factory=SafetyConfig)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Parse, run, report. Returns the exit status: 0, or 2 for bad input."""
+    options = tyro.cli(DeployOptions, args=argv, prog="python -m cotap.deploy")
+    try:
+        deploy(options)
+    except (ValueError, OSError, ModuleNotFoundError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+    return 0
+
+
+def deploy(options: DeployOptions) -> dict[str, Any]:
+    """Run, print the table, write what was asked for, and return the result."""
+    from cotap.agents.checkpoint import write_json
+    from cotap.deployment.controller import law_config, robot_of
+    from cotap.deployment.keyboard import HELP, KeyboardPilot, raw_terminal
+    from cotap.deployment.policy import OnnxPolicy
+    from cotap.deployment.trials import report, run_trials
+
+    require_positive_int("trials", options.trials)
+    for part in (options.engine, options.perturbations, options.safety):
+        part.check()
+    for name in ("json", "video"):
+        path = getattr(options, name)
+        if path and not Path(path).resolve().parent.is_dir():
+            raise ValueError(f"--{name} {path!r}: its folder does not exist")
+    if options.keyboard and (options.scenario or options.trials > 1):
+        raise ValueError("--keyboard goes with neither --scenario nor --trials")
+    policy = OnnxPolicy(options.policy)
+    spec = robot_of(policy.metadata)
+    scenario = load_scenario(options.scenario, spec) if options.scenario else Scenario(options.seconds)
+    if not options.scenario:
+        scenario.arms.clip = options.arm_motion
+        scenario.check(spec)
+    laws = law_config(policy.metadata)
+    for side in ("left", "right"):
+        text = getattr(options, side) or getattr(scenario, side)
+        if text:
+            setattr(laws, side, parse_law(side, text, replace(laws.of(side))))
+    laws.check()
+    pilot = KeyboardPilot(spec.nominal_height_m) if options.keyboard else None
+    if pilot:
+        scenario.command = (TimedCommand(stand=True),)
+    started = time.perf_counter()
+    with raw_terminal() if options.keyboard else nullcontext():
+        if options.keyboard:
+            print(HELP)
+        trials = run_trials(
+            policy, laws, options.engine, options.perturbations, options.safety, scenario, options.trials, options.seed,
+            pilot,
+        )  # fmt: skip
+    result = report(
+        trials, options.policy, policy, laws, options.engine, options.perturbations, options.safety, scenario,
+        options.seed, started,
+    )  # fmt: skip
+    print(summary(result))
+    if options.json:
+        write_json(Path(options.json), result)
+    if options.video and trials[0].qpos:
+        import numpy as np
+        import torch
+
+        from cotap.evaluation.render import render_frames, write_video
+
+        stride = 2
+        frames = render_frames(spec, torch.from_numpy(np.stack(trials[0].qpos[::stride])))
+        write_video(Path(options.video), frames, 1.0 / (trials[0].dt * stride))
+    return result
+
+
+def summary(result: dict[str, Any]) -> str:
+    """The result as Markdown."""
+    from cotap.evaluation.report import UNITS
+
+    lines = ["| measure | mean | 95 % interval | unit |", "|---|---|---|---|"]
+    for name, m in result["metrics"].items():
+        if m["mean"] is not None:
+            low, high = m["ci95"]
+            lines.append(f"| {name} | {m['mean']:.4f} | {low:.4f} to {high:.4f} | {UNITS.get(name, '')} |")
+    stops = "; ".join(f"stopped, {reason}: {count}" for reason, count in result["stops"].items())
+    falls = f"{result['engine']}: {result['num_falls']} of {result['num_trials']} trials fell"
+    return "\n".join([*lines, "", falls + (f" ({stops})" if stops else "") + f", {result['seconds']:.1f} s"])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

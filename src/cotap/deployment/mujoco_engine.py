@@ -1,0 +1,83 @@
+"""High-fidelity MuJoCo: full collision, small steps, elliptic friction cones, implicit damping, torque limits."""
+
+from __future__ import annotations
+
+# MuJoCo's extension module has no type stubs.
+# pyright: reportAttributeAccessIssue=false
+import mujoco
+import numpy as np
+
+from cotap.deployment.engines import EngineConfig
+from cotap.deployment.joint_law import JointLaw
+from cotap.robots import RobotSpec
+from cotap.robots.mjcf import build_mjspec, hold_base
+
+_CONES = {"elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC, "pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL}
+
+
+class MujocoEngine:
+    """One robot in MuJoCo, with the same model that everything trains on, set up finer.
+
+    The diagonal of the law's damping is integrated implicitly, as a motor driver's own velocity loop would act.
+    """
+
+    def __init__(self, cfg: EngineConfig, spec: RobotSpec) -> None:
+        mj = build_mjspec(spec, cfg.collision, cfg.timestep)
+        hold_base(mj, spec)
+        self.model = model = mj.compile()
+        model.opt.cone = _CONES[cfg.cone]
+        model.eq_active0[:] = 0
+        model.actuator_forcerange[:] *= cfg.torque_limit_scale
+        model.actuator_biasprm[:] = 0.0
+        feet = {model.body(foot.body).id for foot in spec.feet}
+        model.geom_friction[[g for g in range(model.ngeom) if model.geom_bodyid[g] in feet], 0] = cfg.friction
+        self.data = mujoco.MjData(model)
+        self.qpos, self.qvel = self.data.qpos, self.data.qvel
+        self._mass, self._inertia = model.body_mass.copy(), model.body_inertia.copy()
+        self._hands = [
+            (model.body(arm.hand_body).id, np.array(arm.hand_point) - np.array(spec.body(arm.hand_body).com))
+            for arm in spec.arms
+        ]
+
+    def sensor(self, name: str) -> np.ndarray:
+        """As `Engine.sensor`."""
+        sensor = self.model.sensor(name)
+        return self.data.sensordata[sensor.adr[0] : sensor.adr[0] + sensor.dim[0]]
+
+    def reset(self, qpos: np.ndarray, qvel: np.ndarray, mass_scale: float) -> None:
+        """As `Engine.reset`."""
+        self.model.body_mass[:], self.model.body_inertia[:] = mass_scale * self._mass, mass_scale * self._inertia
+        mujoco.mj_setConst(self.model, self.data)
+        mujoco.mj_resetData(self.model, self.data)
+        self.qpos[:], self.qvel[:] = qpos, qvel
+        mujoco.mj_forward(self.model, self.data)
+
+    def hold(self, held: bool) -> None:
+        """As `Engine.hold`."""
+        equality = self.model.equality("fixed_base").id
+        if held:
+            inverse, origin = np.zeros(4), np.zeros(3)
+            mujoco.mju_negPose(origin, inverse, self.qpos[:3], self.qpos[3:7])
+            self.model.eq_data[equality, 3:10] = np.concatenate((origin, inverse))
+        self.data.eq_active[equality] = held
+
+    def advance(self, law: JointLaw, steps: int, hand_force_w: np.ndarray) -> None:
+        """As `Engine.advance`."""
+        model, data = self.model, self.data
+        damping = np.diag(law.damping)
+        model.actuator_biasprm[:, 2] = -damping
+        self._push(hand_force_w)
+        q, dq = data.qpos[7:], data.qvel[6:]
+        for _ in range(steps):
+            data.ctrl[:] = law.torque(q, dq) + damping * dq
+            mujoco.mj_step(model, data)
+
+    def close(self) -> None:
+        """As `Engine.close`."""
+
+    def _push(self, force_w: np.ndarray) -> None:
+        mujoco.mj_kinematics(self.model, self.data)
+        for (body, lever), force in zip(self._hands, force_w, strict=True):
+            # MuJoCo takes a wrench at the centre of mass.
+            lever_w = self.data.xmat[body].reshape(3, 3) @ lever
+            self.data.xfrc_applied[body] = np.concatenate((force, np.cross(lever_w, force)))

@@ -1,0 +1,79 @@
+"""An ONNX policy on onnxruntime and numpy alone: torch is not needed, and not imported."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cotap.deployment.metadata import ACTION, INPUT, TARGETS, PolicyError, PolicyMetadata, read_metadata
+
+
+class OnnxPolicy:
+    """Observation in, joint targets out, on one processor thread.
+
+    Args:
+        path: What `python -m cotap.export` wrote.
+
+    Raises:
+        PolicyError: the file is missing, is not ONNX, lacks metadata, or has other inputs or outputs than a policy.
+        ModuleNotFoundError: onnxruntime is not installed.
+    """
+
+    metadata: PolicyMetadata
+
+    def __init__(self, path: Path | str) -> None:
+        import onnxruntime
+
+        where = f"policy {str(path)!r}"
+        if not Path(path).is_file():
+            raise PolicyError(f"{where} does not exist")
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        options.log_severity_level = 4  # what goes wrong is raised; it need not be printed as well
+        try:
+            self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        except Exception as error:  # onnxruntime's errors share no base but this
+            raise PolicyError(f"{where} cannot be read as ONNX: {str(error).splitlines()[0]}") from error
+        self.metadata = read_metadata(where, self._session.get_modelmeta().custom_metadata_map)
+        joints, width = len(self.metadata.joints), self.metadata.observation_width
+        self._require(where, "inputs", self._session.get_inputs(), {INPUT: [1, width]})
+        wanted = {TARGETS: [1, joints], ACTION: [1, joints]}
+        self._require(where, "outputs", self._session.get_outputs(), wanted)
+        self._input = np.zeros((1, width), dtype=np.float32)
+
+    def __call__(self, observation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Joint targets (J,) [rad], for arms that are sent to the reference observed, and the action (J,) to observe
+        next, both float64.
+
+        Args:
+            observation: (width,).
+        """
+        self._input[0] = observation
+        targets, action = self._session.run([TARGETS, ACTION], {INPUT: self._input})
+        return np.asarray(targets, dtype=np.float64)[0], np.asarray(action, dtype=np.float64)[0]
+
+    @staticmethod
+    def _require(where: str, kind: str, found: Sequence[Any], wanted: dict[str, list[int]]) -> None:
+        got = {value.name: value.shape for value in found if value.type == "tensor(float)"}
+        if got != wanted:
+            shown = {value.name: (value.type, value.shape) for value in found}
+            raise PolicyError(f"{where} has {kind} {shown}; its metadata asks for float32 {wanted}")
+
+
+def arm_advance(
+    metadata: PolicyMetadata, observed: np.ndarray, position: np.ndarray, velocity: np.ndarray
+) -> np.ndarray:
+    """What to add to the arms' targets (U,) [rad]: they are sent where the reference will be, not where it was seen.
+
+    Args:
+        metadata: The policy's.
+        observed: (U,) reference arm position in the observation [rad].
+        position: (U,) reference at the end of the control step [rad].
+        velocity: (U,) its velocity then [rad/s].
+    """
+    if metadata.arm_action["mode"] != "residual":
+        return np.zeros_like(observed)
+    return position + metadata.arm_action["reference_lead_s"] * velocity - observed

@@ -1,0 +1,168 @@
+"""What a robot is asked to do, from a small file: commands and forces over time, the arms' motion and laws."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from cotap.checks import require_finite, require_range
+from cotap.configs import from_plain
+from cotap.envs.commands import CommandSource
+from cotap.envs.forces import ForceProfile, ScriptedForces
+from cotap.envs.reference import ReferenceConfig, ReferenceMotion
+from cotap.robots import RobotSpec
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+
+@dataclass
+class TimedCommand:
+    """From a moment on; approached at the rates that the policy was trained with."""
+
+    at: float = 0.0
+    """When [s]."""
+    velocity: tuple[float, float] = (0.0, 0.0)
+    """Forward and leftward [m/s]."""
+    yaw_rate: float = 0.0
+    """Positive to the left [rad/s]."""
+    stand: bool = False
+    """Stand; velocities must then be zero."""
+    height_offset: float = 0.0
+    """Torso height against nominal, in stance [m]."""
+
+    def check(self, where: str) -> None:
+        """Raise ValueError naming the first field, under `where`, that is out of its range."""
+        require_range(f"{where}.at", self.at, 0.0, 1e6)
+        _require_length(f"{where}.velocity", self.velocity, 2)
+        for i, value in enumerate(self.velocity):
+            require_range(f"{where}.velocity[{i}]", value, -5.0, 5.0)
+        require_range(f"{where}.yaw_rate", self.yaw_rate, -5.0, 5.0)
+        require_range(f"{where}.height_offset", self.height_offset, -0.5, 0.0)
+        if not isinstance(self.stand, bool):
+            raise ValueError(f"{where}.stand must be true or false, got {self.stand!r}")
+        if self.stand and (any(self.velocity) or self.yaw_rate):
+            raise ValueError(f"{where} stands and moves: velocity {self.velocity}, yaw_rate {self.yaw_rate}")
+
+    def give(self, commands: CommandSource, nominal_height_m: float) -> None:
+        """Hand this command over."""
+        commands.override(
+            torch.tensor([list(self.velocity)], dtype=torch.float32), torch.tensor([float(self.yaw_rate)]),
+            torch.tensor([self.stand]), torch.tensor([nominal_height_m + self.height_offset]),
+        )  # fmt: skip
+
+
+@dataclass
+class ArmMotion:
+    """What the arms' reference does: holds a pose, or follows a clip; neither for the default pose."""
+
+    pose: tuple[float, ...] = ()
+    """Arm joints, left arm first [rad]."""
+    clip: str = ""
+    """Name of a clip in the motion library; `random` mixes clips and generated motion as in training."""
+
+    def check(self, spec: RobotSpec) -> None:
+        """Raise ValueError naming the first field that is out of its range."""
+        if self.pose and self.clip:
+            raise ValueError("arms: give a pose or a clip, not both")
+        if self.pose:
+            _require_length("arms.pose", self.pose, len(spec.upper_joints))
+        for i, (value, name) in enumerate(zip(self.pose, spec.upper_joints, strict=False)):
+            joint = spec.joints[spec.indices([name])[0]]
+            require_range(f"arms.pose[{i}] ({name})", value, *joint.range_rad)
+        if not isinstance(self.clip, str):
+            raise ValueError(f"arms.clip must be a name, got {self.clip!r}")
+
+    def reference(self, spec: RobotSpec, dt: float) -> ReferenceMotion:
+        """The reference of one robot. Raises MotionError for a clip that is not there."""
+        cfg = ReferenceConfig()
+        if self.clip != "random":
+            cfg.clips.share = 1.0 if self.clip else 0.0
+            cfg.clips.only = (self.clip,) if self.clip else ()
+        motion = ReferenceMotion(cfg, spec, 1, dt)
+        if not self.clip:
+            motion.hold(torch.tensor(self.pose) if self.pose else motion.default)
+        return motion
+
+
+@dataclass
+class Scenario:
+    """All of it. Without commands, random ones as the velocity-tracking evaluation draws them."""
+
+    seconds: float = 20.0
+    """How long [s]."""
+    arms: ArmMotion = field(default_factory=ArmMotion)
+    left: str = ""
+    """The left arm's law, as in cotap:alpha=0.7,stiffness=500; by default the one that the policy was trained under."""
+    right: str = ""
+    """The right arm's law."""
+    command: tuple[TimedCommand, ...] = ()
+    """In the order of their times."""
+    force: tuple[ForceProfile, ...] = ()
+    """On the hands, heading frame; they add up."""
+
+    def check(self, spec: RobotSpec) -> None:
+        """Raise ValueError naming the first field that is out of its range."""
+        require_range("seconds", self.seconds, 0.02, 36000.0)
+        self.arms.check(spec)
+        for i, command in enumerate(self.command):
+            command.check(f"command[{i}]")
+            if i and command.at < self.command[i - 1].at:
+                raise ValueError(f"command[{i}].at is {command.at} s, before the one ahead of it")
+        for i, force in enumerate(self.force):
+            _require_length(f"force[{i}].force", force.force, 3)
+            try:
+                force.check()
+            except ValueError as error:
+                raise ValueError(f"force[{i}]: {error}") from error
+            if force.place != "hand":
+                raise ValueError(f"force[{i}].place must be 'hand' in a scenario, got {force.place!r}")
+            for axis, value in enumerate(force.force):
+                require_finite(f"force[{i}].force[{axis}]", value)
+
+    def forces(self, spec: RobotSpec, dt: float) -> list[ScriptedForces]:
+        """The forces, for one robot with this control step [s]."""
+        return [ScriptedForces(force, tuple(arm.side for arm in spec.arms), 1, dt) for force in self.force]
+
+
+def load_scenario(path: Path | str, spec: RobotSpec) -> Scenario:
+    """Read a scenario from TOML.
+
+    Raises:
+        ValueError: the file is missing, is not TOML, or has a field that is unknown or out of its range; the message
+            names the file and the field.
+    """
+    try:
+        data = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise ValueError(f"scenario {str(path)!r} does not exist") from error
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise ValueError(f"scenario {str(path)!r} is not TOML: {error}") from error
+    try:
+        scenario = from_plain(Scenario, data)
+        scenario.command = _records(TimedCommand, "command", data)
+        scenario.force = _records(ForceProfile, "force", data)
+        if not isinstance(scenario.arms, ArmMotion):
+            raise ValueError(f"arms must be a table, got {scenario.arms!r}")
+        scenario.check(spec)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"scenario {str(path)!r}: {error}") from error
+    return scenario
+
+
+def _records(kind: type[Any], name: str, data: dict[str, Any]) -> tuple[Any, ...]:
+    entries = data.get(name, [])
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise ValueError(f"{name} must be a list of tables ([[{name}]]), got {entries!r}")
+    return tuple(from_plain(kind, entry) for entry in entries)
+
+
+def _require_length(name: str, value: Any, length: int) -> None:
+    if not isinstance(value, (tuple, list)) or len(value) != length:
+        raise ValueError(f"{name} must hold {length} numbers, got {value!r}")

@@ -1,0 +1,287 @@
+"""One policy in several engines: velocity tracking, impact, constant and periodic load, and what robots do wrong.
+
+The paper's section IV-C, with predictions beside what was measured where statics makes them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from cotap.checks import require_positive_int, require_range
+from cotap.compliance.laws import LawConfig
+from cotap.configs import to_plain
+from cotap.deployment.controller import command_config, law_config, robot_of
+from cotap.deployment.engines import EngineConfig, EngineState, make_engine
+from cotap.deployment.policy import OnnxPolicy
+from cotap.deployment.robot import Perturbations
+from cotap.deployment.safety import SafetyConfig
+from cotap.deployment.scenario import Scenario, TimedCommand
+from cotap.deployment.trial import Trial, trajectory
+from cotap.deployment.trials import run_trials
+from cotap.envs import H1EnvConfig
+from cotap.envs.forces import ForceProfile
+from cotap.envs.state import StateReader
+from cotap.envs.upper_body import UpperBody, UpperBodyConfig
+from cotap.evaluation.disturbance import ConstantLoad, Impact, window_measures
+from cotap.evaluation.law_options import parse_law
+from cotap.evaluation.metrics import summarize, tracking_measures
+from cotap.robots import RobotSpec
+
+STAND = (TimedCommand(stand=True),)
+ONSET_S = 3.0
+PERTURBATIONS = {
+    "none": Perturbations(),
+    "delay of 1 step": Perturbations(delay_steps=(1, 1)),
+    "delay of 2 steps": Perturbations(delay_steps=(2, 2)),
+    "5 % of readings lost": Perturbations(drop=0.05),
+    "encoder noise of 0.01 rad, 0.5 rad/s": Perturbations(encoder_noise=0.01, velocity_noise=0.5),
+    "masses wrong by 20 %": Perturbations(mass_error=0.2),
+    "start off by 0.05 rad": Perturbations(start_error=0.05),
+    "all at once, delay of 1 to 2 steps": Perturbations((1, 2), 0.05, 0.01, 0.5, 0.2, 0.05),
+}
+"""Every row of the table of perturbations."""
+LAWS = {
+    "PD": "pd", "soft PD": "soft-pd", "K 100": "cotap:stiffness=100", "K 500": "cotap:stiffness=500",
+    "K 800": "cotap:stiffness=800", "alpha 0.7, K 500": "cotap:stiffness=500,alpha=0.7",
+}  # fmt: skip
+"""Laws that impact and constant load compare."""
+
+
+@dataclass
+class Comparison:
+    """What is run; every part in every engine."""
+
+    engines: tuple[str, ...] = ("mujoco", "pybullet")
+    """Engines, by name."""
+    trials: int = 100
+    """Trials of velocity tracking."""
+    perturbed_trials: int = 20
+    """Trials of each perturbation; the first engine only."""
+    load_trials: int = 4
+    """Trials of each law under each load."""
+    seconds: float = 20.0
+    """Length of a trial of velocity tracking or under perturbations [s]."""
+    seed: int = 0
+    """Seed of all of it."""
+    timestep: float = 0.001
+    """Physics step [s]."""
+
+    def check(self) -> None:
+        """Raise ValueError naming the first field that is out of its range."""
+        for name in ("trials", "perturbed_trials", "load_trials"):
+            require_positive_int(name, getattr(self, name))
+        require_range("seconds", self.seconds, 2.0, 3600.0)
+        if not self.engines:
+            raise ValueError("engines must name at least one engine")
+        for name in self.engines:
+            self.engine(name).check()
+
+    def engine(self, name: str) -> EngineConfig:
+        """The engine of that name."""
+        return EngineConfig(name, self.timestep)
+
+
+Run = Callable[..., list[Trial]]
+
+
+def compare(policy: OnnxPolicy, cfg: Comparison) -> dict[str, Any]:
+    """Run everything. Returns what the report is written from."""
+    spec, result = robot_of(policy.metadata), {"settings": to_plain(cfg), "engines": {}}
+    result["dt"] = policy.metadata.control_dt
+    result["settings"]["checkpoint_sha256"] = policy.metadata.checkpoint_sha256
+    for name in cfg.engines:
+        engine = cfg.engine(name)
+
+        def run(
+            scenario: Scenario, count: int, laws: UpperBodyConfig | None = None, wrong: Perturbations | None = None,
+            engine: EngineConfig = engine,
+        ) -> list[Trial]:  # fmt: skip
+            return run_trials(
+                policy, laws or law_config(policy.metadata), engine, wrong or Perturbations(), SafetyConfig(), scenario,
+                count, cfg.seed,
+            )  # fmt: skip
+
+        result["engines"][name] = {
+            "velocity-tracking": tracking(run(Scenario(cfg.seconds), cfg.trials), policy, cfg),
+            "impact": loads(run, spec, Impact(onset=ONSET_S), cfg),
+            "constant-load": loads(run, spec, ConstantLoad(onset=ONSET_S), cfg),
+            "periodic-load": periodic(run, spec, cfg),
+        }
+        if name == cfg.engines[0]:
+            result["perturbations"] = {
+                label: falls(run(Scenario(cfg.seconds), cfg.perturbed_trials, wrong=wrong))
+                for label, wrong in PERTURBATIONS.items()
+            }
+    return result
+
+
+def falls(trials: list[Trial]) -> dict[str, Any]:
+    """How many fell, with the 95 % interval of the rate (Wilson's)."""
+    n, k, z = len(trials), sum(t.fell for t in trials), 1.96
+    middle = (k + 0.5 * z * z) / (n + z * z)
+    half = z / (n + z * z) * math.sqrt(k * (n - k) / n + 0.25 * z * z)
+    return {"trials": n, "falls": k, "ci95": [max(0.0, middle - half), min(1.0, middle + half)]}
+
+
+def tracking(trials: list[Trial], policy: OnnxPolicy, cfg: Comparison) -> dict[str, Any]:
+    """Falls and tracking errors."""
+    gait = command_config(policy.metadata).gait_period_s
+    measures = tracking_measures(_trajectory(trials, cfg.seconds), gait)
+    names = ("e_lin", "e_lin_gait", "e_yaw_gait", "e_height", "e_upper", "stand_drift", "swing_height")
+    return falls(trials) | {"metrics": {name: summarize(measures[name], cfg.seed) for name in names}}
+
+
+def loads(run: Run, spec: RobotSpec, protocol: Impact, cfg: Comparison) -> dict[str, Any]:
+    """A blow or a held load on the left hand, standing, law by law."""
+    out: dict[str, Any] = {}
+    force = ForceProfile(protocol.force, protocol.hand, protocol.onset, protocol.duration)
+    scenario = Scenario(protocol.seconds, command=STAND, force=(force,))
+    for label, text in LAWS.items():
+        law = parse_law("left", text, LawConfig(null_stiffness=25.0))
+        trials = run(scenario, cfg.load_trials, UpperBodyConfig(law, replace(law)), Perturbations(start_error=0.02))
+        t = _trajectory(trials, protocol.seconds)
+        begin, first, last = (round((protocol.onset + s) / t.dt) for s in (0.0, *protocol.window))
+        hit = [i for i, arm in enumerate(spec.arms) if protocol.hand in (arm.side, "both")]
+        measures = window_measures(t, first, last, hit)
+        names = ("e_torso", "e_ee", "e_ee_hit", "j_upper", "e_upper")
+        out[label] = falls(trials) | {
+            "metrics": {name: summarize(measures[name], cfg.seed) for name in names},
+            "displacement_z": float((t.hand_offset[-1] - t.hand_offset[begin - 1])[:, 0, 2].mean()),
+            "curve": t.hand_error[begin - round(0.5 / t.dt) :, :, 0].mean(1).tolist(),
+        }
+    return out
+
+
+def periodic(
+    run: Run, spec: RobotSpec, cfg: Comparison, amplitude: float = 30.0, period: float = 4.0
+) -> dict[str, Any]:
+    """30 N up and down on both hands, right arm PD, left arm under compliance: swings at that period, and statics'.
+
+    A slow load asks for joint torque `J^T F` whatever the stiffness, and moves the hand by `J K^-1 J^T F`.
+    """
+    laws = UpperBodyConfig(LawConfig("cotap", (500.0, 500.0, 500.0), 25.0, 0.7), LawConfig("pd"))
+    load = ForceProfile((0.0, 0.0, amplitude), "both", ONSET_S, period_s=period)
+    seconds = ONSET_S + 3.0 * period
+    trials = run(Scenario(seconds, command=STAND, force=(load,)), cfg.load_trials, laws)
+    t = _trajectory(trials, seconds)
+    begin = round((ONSET_S + period) / t.dt)  # the first period is left out
+    hands = t.hand_offset[begin:, :, :, 2].mean(1).double().numpy()
+    elbow = [spec.upper_joints.index(arm.joints[-1]) for arm in spec.arms]
+    torque = t.arm_torque[begin:, :, elbow].mean(1).double().numpy()
+    pose = np.mean([np.mean(trial.qpos[begin:], 0) for trial in trials if len(trial.qpos) > begin] or [[0.0]], 0)
+    out = falls(trials) | {"time": (np.arange(len(torque)) * t.dt).tolist(), "arms": {}}
+    predicted = statics(spec, laws, pose, amplitude) if pose.size > 1 else None
+    for i, arm in enumerate(spec.arms):
+        out["arms"][arm.side] = {
+            "elbow_torque_nm": swing(torque[:, i], t.dt, period),
+            "hand_swing_m": swing(hands[:, i], t.dt, period),
+            "elbow_torque_statics_nm": None if predicted is None else predicted[i][0],
+            "hand_swing_statics_m": None if predicted is None else predicted[i][1],
+            "torque": torque[:, i].tolist(),
+            "height": (hands[:, i] - hands[0, i]).tolist(),
+        }
+    return out
+
+
+def swing(values: np.ndarray, dt: float, period: float) -> float:
+    """Amplitude of the part of `values` (T,) that has this period, by least squares."""
+    angle = 2.0 * math.pi * dt * np.arange(len(values)) / period
+    basis = np.stack((np.sin(angle), np.cos(angle), np.ones_like(angle), angle), 1)
+    s, c = np.linalg.lstsq(basis, values, rcond=None)[0][:2]
+    return float(math.hypot(s, c))
+
+
+def statics(spec: RobotSpec, laws: UpperBodyConfig, qpos: np.ndarray, force_z: float) -> list[tuple[float, float]]:
+    """Per arm, what a vertical force [N] asks of the elbow [Nm] and how far it moves the hand upwards [m], at rest."""
+    cfg = EngineConfig()
+    engine = make_engine(cfg, spec)
+    engine.reset(qpos, np.zeros(len(qpos) - 1), 1.0)
+    reader = StateReader(spec, EngineState(engine), torch.float64)
+    state = reader.read()
+    body = UpperBody(laws, spec, 1, H1EnvConfig().control_dt, torch.float64)
+    body.send(state, state.joint_pos[:, len(spec.lower_joints) :])
+    to_heading = state.heading_w.transpose(1, 2) @ state.torso_rotation_w
+    jacobian = (to_heading.unsqueeze(1) @ reader.arm_chains.jacobian(state.arms))[0]
+    compliance = jacobian @ torch.linalg.inv(body.newest.stiffness[0]) @ jacobian.transpose(-1, -2)
+    return [
+        (abs(float(jacobian[i, 2, -1])) * force_z, float(compliance[i, 2, 2]) * force_z) for i in range(len(spec.arms))
+    ]
+
+
+def _trajectory(trials: list[Trial], seconds: float) -> Any:
+    return trajectory([trial for trial in trials if trial.rows], round(seconds / trials[0].dt))
+
+
+def markdown(result: dict[str, Any]) -> str:
+    """The report."""
+    engines = result["engines"]
+    lines = ["## Velocity tracking", "", "| measure | " + " | ".join(engines) + " |", "|---" * (len(engines) + 1) + "|"]
+    lines.append("| trials that fell | " + " | ".join(_falls(e["velocity-tracking"]) for e in engines.values()) + " |")
+    for name in next(iter(engines.values()))["velocity-tracking"]["metrics"]:
+        row = [_mean(e["velocity-tracking"]["metrics"][name]) for e in engines.values()]
+        lines.append(f"| {name} | " + " | ".join(row) + " |")
+    for part, title in (("impact", "Impact of 500 N for 0.05 s"), ("constant-load", "Constant load of -50 N")):
+        lines += ["", f"## {title}, left hand, stance", ""]
+        lines += ["| engine | law | fell | e_torso [m/s] | e_ee_hit [m] | j_upper [Nm] | hand z at the end [m] |",
+                  "|---|---|---|---|---|---|---|"]  # fmt: skip
+        for name, e in engines.items():
+            for label, row in e[part].items():
+                m = row["metrics"]
+                shown = " | ".join(_mean(m[k]) for k in ("e_torso", "e_ee_hit", "j_upper"))
+                lines.append(f"| {name} | {label} | {_falls(row)} | {shown} | {row['displacement_z']:+.3f} |")
+    lines += ["", "## Periodic load of 30 N, 4 s, both hands: left alpha 0.7 at 500 N/m, right PD", ""]
+    lines += [
+        "| engine | arm | elbow torque [Nm] | of it statics | hand swing [m] | of it statics |",
+        "|---|---|---|---|---|---|",
+    ]
+    for name, e in engines.items():
+        for side, arm in e["periodic-load"]["arms"].items():
+            cells = (
+                arm[k] for k in ("elbow_torque_nm", "elbow_torque_statics_nm", "hand_swing_m", "hand_swing_statics_m")
+            )
+            lines.append(f"| {name} | {side} | " + " | ".join("-" if v is None else f"{v:.3f}" for v in cells) + " |")
+    lines += ["", f"## Perturbations, {next(iter(engines))}", "", "| what is wrong | fell |", "|---|---|"]
+    lines += [f"| {label} | {_falls(row)} |" for label, row in result["perturbations"].items()]
+    return "\n".join(lines) + "\n"
+
+
+def _falls(row: dict[str, Any]) -> str:
+    low, high = row["ci95"]
+    return f"{row['falls']} of {row['trials']} ({100 * low:.0f} to {100 * high:.0f} %)"
+
+
+def _mean(m: dict[str, Any]) -> str:
+    return "-" if m["mean"] is None else f"{m['mean']:.3f} ({m['ci95'][0]:.3f} to {m['ci95'][1]:.3f})"
+
+
+def figure(result: dict[str, Any], path: Any) -> None:
+    """Impact, constant load and periodic load over time, and falls under perturbations, as a picture."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    engines = result["engines"]
+    fig, axes = plt.subplots(len(engines), 3, figsize=(15, 3.6 * len(engines)), constrained_layout=True, squeeze=False)
+    for row, (name, e) in zip(axes, engines.items(), strict=True):
+        for axis, part in zip(row, ("impact", "constant-load"), strict=False):
+            for label, law in e[part].items():
+                axis.plot(result["dt"] * np.arange(len(law["curve"])) - 0.5, law["curve"], label=label, lw=1.2)
+            axis.set(title=f"{name}, {part}", xlabel="time since the onset [s]", ylabel="error of the hand hit [m]")
+            axis.legend(frameon=False, fontsize=7)
+        p, axis = e["periodic-load"], row[2]
+        for side, color in (("left", "#2171b5"), ("right", "#d95f02")):
+            law = "alpha 0.7, 500 N/m" if side == "left" else "PD"
+            axis.plot(p["time"], p["arms"][side]["torque"], color=color, lw=1.2, label=f"{side}, {law}")
+        axis.set(title=f"{name}, periodic load", xlabel="time [s]", ylabel="elbow torque [Nm]")
+        axis.legend(frameon=False, fontsize=7)
+        for axis in row:
+            axis.grid(alpha=0.2)
+    fig.savefig(path, dpi=130, format="png")
+    plt.close(fig)

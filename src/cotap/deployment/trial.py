@@ -1,0 +1,151 @@
+"""One robot from start-up to the end of a trial, recorded."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from cotap.deployment.controller import Controller
+from cotap.deployment.joint_law import damped_law
+from cotap.deployment.robot import Robot
+from cotap.deployment.safety import SafetyConfig, Watchdog
+from cotap.deployment.scenario import Scenario
+from cotap.envs.state import RobotState
+from cotap.envs.terminations import TerminationConfig, diverged, fallen
+from cotap.evaluation.rollout import Trajectory, arm_static_torque
+
+Pilot = Callable[[Controller, float], bool]
+"""Called at every control step with the time [s]: may change commands, and says whether to go on."""
+STOP_S = 1.0
+"""How long a robot that fell or stopped itself is recorded [s]."""
+
+
+@dataclass
+class Trial:
+    """What happened. T control steps."""
+
+    dt: float
+    rows: list[dict[str, torch.Tensor]] = field(default_factory=list)
+    """Fields of a `Trajectory`, (1, ...) each, and `torque` (1, J)."""
+    qpos: list[np.ndarray] = field(default_factory=list)
+    """(T) of (7 + J,)."""
+    stopped: str = ""
+    """Why the robot stopped itself; empty if it did not."""
+    stopped_at_s: float | None = None
+    fell: bool = False
+    """Too low or too tilted, or stopped: what a stopped robot goes on to do is no merit of its policy."""
+
+
+def start_up(robot: Robot, controller: Controller, safety: SafetyConfig, seed: int) -> None:
+    """Bring the robot to its first pose with rising gains while its base is held, and let it go."""
+    controller.restart()
+    default = np.array([j.default_rad for j in robot.spec.joints])
+    pose = np.concatenate((default[: len(robot.spec.lower_joints)], controller.initial_arms))
+    robot.start(pose, seed)
+    ramp = round(safety.ramp_s / controller.dt)
+    if ramp == 0:
+        return
+    free = np.zeros((len(robot.spec.arms), 3))
+    robot.engine.hold(True)
+    for k in range(ramp):
+        robot.act(robot.holding(pose).ramped((k + 1) / ramp), free)
+    for _ in range(round(safety.settle_s / controller.dt)):
+        robot.act(robot.holding(pose), free)
+    robot.engine.hold(False)
+
+
+def run_trial(
+    robot: Robot, controller: Controller, scenario: Scenario, safety: SafetyConfig, seed: int = 0,
+    pilot: Pilot | None = None,
+) -> Trial:  # fmt: skip
+    """Start the robot up and run the scenario until its end, a fall, or a stop and what follows it."""
+    commands, dt, trial = list(scenario.command), controller.dt, Trial(controller.dt)
+    if commands and commands[0].at == 0.0:  # the robot begins with it, it need not change over
+        commands[0].give(controller.commands, robot.spec.nominal_height_m)
+    start_up(robot, controller, safety, seed)
+    watchdog = Watchdog(safety, robot.spec.joint_names, robot.torque_limit, dt)
+    forces, falling = scenario.forces(robot.spec, dt), TerminationConfig()
+    left = math.inf
+    for k in range(round(scenario.seconds / dt)):
+        while commands and commands[0].at <= k * dt + 1e-9:
+            commands.pop(0).give(controller.commands, robot.spec.nominal_height_m)
+        if pilot and not pilot(controller, k * dt):
+            break
+        readings = robot.read()
+        law = controller.step(readings)
+        if not trial.stopped:
+            trial.stopped = watchdog.reason(readings, law)
+            if trial.stopped:
+                trial.stopped_at_s = k * dt
+        if trial.stopped:
+            law = damped_law(robot.damping)
+        push = sum(
+            (f.at(torch.tensor([k * dt]))[0, :-1].double().numpy() for f in forces), np.zeros((len(robot.spec.arms), 3))
+        )
+        robot.act(law, push, at_once=bool(trial.stopped))
+        qpos, qvel = (torch.from_numpy(x).unsqueeze(0) for x in (robot.engine.qpos, robot.engine.qvel))
+        if diverged(qpos, qvel).any():
+            trial.fell, trial.stopped = True, trial.stopped or "the simulation diverged"
+            break
+        truth = robot.truth()
+        down = bool(fallen(falling, truth.height, truth.projected_gravity_t))
+        trial.fell = trial.fell or down or bool(trial.stopped)
+        trial.rows.append(_row(robot, controller, truth, push, trial.fell))
+        trial.qpos.append(robot.engine.qpos.copy())
+        if trial.fell:
+            left = min(left, round(STOP_S / dt)) - 1
+        if left <= 0:
+            break
+    return trial
+
+
+def _row(
+    robot: Robot, controller: Controller, s: RobotState, force_h: np.ndarray, fell: bool
+) -> dict[str, torch.Tensor]:
+    c = controller.commands.current()
+    first = len(robot.spec.lower_joints)
+    reference = controller.motion.current().position.double()
+    torque = torch.from_numpy(robot.torque()).unsqueeze(0)
+    offset_t = s.arms.tip - controller.arm_pose(reference).tip
+    force_w = torch.from_numpy(force_h).unsqueeze(0) @ s.heading_w.transpose(1, 2)
+    limit = torch.from_numpy(robot.torque_limit)[first:]
+    return {
+        "velocity": torch.cat((s.torso_linear_velocity_h[:, :2], s.yaw_rate.unsqueeze(1)), 1),
+        "command": torch.cat((c.velocity_h, c.yaw_rate.unsqueeze(1)), 1),
+        "stand": c.stand > 0.5,
+        "told_to_stand": controller.commands.told_to_stand,
+        "height": s.height,
+        "height_command": c.height,
+        "position": s.torso_pos_w[:, :2],
+        "arm_error": s.joint_pos[:, first:] - reference,
+        "arm_velocity": s.joint_vel[:, first:],
+        "arm_torque": torque[:, first:],
+        "arm_at_limit": (torque[:, first:].abs() > 0.999 * limit).any(1),
+        "arm_static_torque": arm_static_torque(controller.upper_body.arms, s, force_w),
+        "hand_offset": offset_t @ (s.heading_w.transpose(1, 2) @ s.torso_rotation_w).transpose(1, 2),
+        "hand_error": offset_t.norm(dim=2),
+        "foot_contact": s.foot_contact,
+        "foot_speed": s.foot_velocity_w[:, :, :2].norm(dim=2),
+        "foot_height": s.foot_pos_w[:, :, 2],
+        "path_error": torch.full_like(s.height, math.nan),
+        "fell": torch.tensor([fell]),
+        "torque": torque,
+    }
+
+
+def trajectory(trials: list[Trial], steps: int) -> Trajectory:
+    """Trials as worlds (T, N, ...). A trial that ended early is fallen from then on; its last row is repeated."""
+    columns: dict[str, list[torch.Tensor]] = {}
+    for trial in trials:
+        rows = trial.rows[:steps]
+        rows = rows + [rows[-1]] * (steps - len(rows))
+        for name in rows[0]:
+            if name == "torque":
+                continue
+            value = torch.stack([row[name] for row in rows])
+            columns.setdefault(name, []).append(value if value.dtype == torch.bool else value.float())
+    return Trajectory(trials[0].dt, **{name: torch.cat(values, 1) for name, values in columns.items()})

@@ -1,0 +1,54 @@
+"""`python -m cotap.export`: a checkpoint as one ONNX file."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from cotap.checks import require_positive_int
+
+
+@dataclass
+class ExportOptions:
+    """Both actors, observation normalisation and what is fed forward, with the metadata that a robot needs."""
+
+    output: str
+    """Where the ONNX file goes."""
+    checkpoint: str = ""
+    """Checkpoint to export; by default the shipped base policy."""
+    checks: int = 1000
+    """Observations over which the file is compared with torch before it is kept."""
+    seed: int = 0
+    """Seed of those observations."""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Parse, export, report. Returns the exit status: 0, 2 for bad input, 1 if the file's numbers are not torch's."""
+    options = tyro.cli(ExportOptions, args=argv, prog="python -m cotap.export")
+    try:
+        from cotap.deployment.graph import export_policy
+        from cotap.evaluation.policy import default_checkpoint
+
+        require_positive_int("checks", options.checks)
+        output = Path(options.output)
+        if output.suffix != ".onnx":
+            raise ValueError(f"--output must end in .onnx, got {options.output!r}")
+        if not output.resolve().parent.is_dir():
+            raise ValueError(f"--output {options.output!r}: its folder does not exist")
+        checkpoint = options.checkpoint or default_checkpoint()
+        summary, worst = export_policy(checkpoint, output, options.checks, options.seed)
+    except (ValueError, OSError, ModuleNotFoundError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except ArithmeticError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    print(f"{output}: {summary}; differs from torch by at most {worst:.1e} over {options.checks} observations")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

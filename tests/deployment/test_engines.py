@@ -1,0 +1,169 @@
+"""Engines behind one interface: MuJoCo's conventions, the same robot, torque limits, holding, pushing."""
+
+from __future__ import annotations
+
+import builtins
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from cotap.compliance.dynamics import joint_inertia
+from cotap.deployment.engines import EngineConfig, EngineState, make_engine
+from cotap.deployment.joint_law import damped_law, pd_law
+from cotap.deployment.rotors import rotor_inertias, with_rotors
+from cotap.envs.state import StateReader
+from cotap.robots.chains import arm_chains, arm_inertias
+
+ENGINES = ["mujoco", "pybullet"]
+FREE = np.zeros((2, 3))
+
+
+@pytest.fixture
+def gains(spec):
+    return tuple(np.array([getattr(j, name) for j in spec.joints]) for name in ("kp", "kd", "default_rad"))
+
+
+@pytest.fixture(params=ENGINES)
+def engine(request, spec):
+    if request.param == "pybullet":
+        pytest.importorskip("pybullet")
+    engine = make_engine(EngineConfig(engine=request.param), spec)
+    yield engine
+    engine.close()
+
+
+def tumbling(default):
+    rng = np.random.default_rng(0)
+    attitude = rng.standard_normal(4)
+    qpos = np.concatenate(([0.3, -0.2, 3.0], attitude / np.linalg.norm(attitude), default + 0.1))
+    return qpos, rng.uniform(-1.0, 1.0, 25)
+
+
+def test_states_and_feet_mean_the_same_everywhere(engine, model, spec, gains):
+    qpos, qvel = tumbling(gains[2])
+    engine.reset(qpos, qvel, 1.0)
+    np.testing.assert_allclose(engine.qpos, qpos, atol=1e-9)
+    np.testing.assert_allclose(engine.qvel, qvel, atol=1e-9)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = qpos, qvel
+    mujoco.mj_forward(model, data)
+    state = StateReader(spec, EngineState(engine), torch.float64).read()
+    for i, foot in enumerate(spec.feet):
+        for kind, field in (("pos", "foot_pos_w"), ("vel", "foot_velocity_w"), ("up", "foot_up_w")):
+            expected = data.sensor(f"{foot.side}_foot_{kind}").data
+            np.testing.assert_allclose(getattr(state, field)[0, i].numpy(), expected, atol=1e-5)
+
+
+def test_flight_keeps_momentum_and_falls_with_g(engine, model, gains):
+    """What no motor can change: the centre of mass of a robot in the air."""
+    kp, kd, default = gains
+    qpos, qvel = tumbling(default)
+    engine.reset(qpos, qvel, 1.0)
+    reference = mujoco.MjData(model)
+    heights = []
+    for _ in range(3):
+        reference.qpos[:] = engine.qpos
+        mujoco.mj_kinematics(model, reference)
+        mujoco.mj_comPos(model, reference)
+        heights.append(reference.subtree_com[0].copy())
+        engine.advance(pd_law(kp, kd, default), 100, FREE)
+    fall = heights[2] - 2.0 * heights[1] + heights[0]
+    np.testing.assert_allclose(fall, [0.0, 0.0, -9.81 * 0.01], atol=2e-3)
+
+
+def test_joints_settle_where_pd_and_gravity_have_them(engine, model, spec, gains):
+    """Base held: statics of the nominal model, whichever engine."""
+    kp, kd, default = gains
+    qpos = np.concatenate(([0.0, 0.0, 1.6, 1.0, 0.0, 0.0, 0.0], default))
+    engine.reset(qpos, np.zeros(25), 1.0)
+    engine.hold(True)
+    engine.advance(pd_law(kp, kd, default), 3000, np.array([[0.0, 0.0, -10.0], [0.0, 0.0, 0.0]]))
+    np.testing.assert_allclose(engine.qpos[:3], qpos[:3], atol=1e-3)
+    data = mujoco.MjData(model)
+    data.qpos[:] = engine.qpos
+    mujoco.mj_forward(model, data)
+    hand = data.body(spec.arms[0].hand_body)
+    jacobian = np.zeros((3, model.nv))
+    point = hand.xpos + hand.xmat.reshape(3, 3) @ spec.arms[0].hand_point
+    mujoco.mj_jac(model, data, jacobian, None, point, hand.id)
+    static = data.qfrc_bias[6:] - jacobian[:, 6:].T @ [0.0, 0.0, -10.0]
+    np.testing.assert_allclose(kp * (default - engine.qpos[7:]), static, atol=0.15)
+    engine.hold(False)
+    engine.advance(damped_law(kd), 300, FREE)
+    assert engine.qpos[2] < 1.5
+
+
+def test_torque_limits_hold(engine, spec, gains):
+    """A joint told to jump by ten radians moves as its limit lets it, not as its gain would."""
+    kp, kd, default = gains
+    low = make_engine(EngineConfig(engine=type(engine).__name__.removesuffix("Engine").lower(),
+                                   torque_limit_scale=0.1), spec)  # fmt: skip
+    elbow = spec.joint_names.index("left_elbow")
+    rates = []
+    for one in (engine, low):
+        one.reset(np.concatenate(([0.0, 0.0, 3.0, 1.0, 0.0, 0.0, 0.0], default)), np.zeros(25), 1.0)
+        target = default.copy()
+        target[elbow] -= 10.0
+        one.advance(pd_law(kp, 0.0 * kd, target), 5, FREE)
+        rates.append(one.qvel[6 + elbow])
+    low.close()
+    assert rates[0] == pytest.approx(10.0 * rates[1], rel=0.25)
+    # 18 Nm for 5 ms on 0.1 kg m^2, a forearm, and an upper arm that gives way where rotors are part of links.
+    assert -18.0 * 0.005 / 0.05 < rates[0] < -18.0 * 0.005 / 0.2
+
+
+def test_heavier_robots_sag_more(engine, spec, gains):
+    kp, kd, default = gains
+    sag = []
+    for scale in (1.0, 1.2):
+        engine.reset(np.concatenate(([0.0, 0.0, 1.6, 1.0, 0.0, 0.0, 0.0], default)), np.zeros(25), scale)
+        engine.hold(True)
+        engine.advance(pd_law(kp, kd, default), 1500, FREE)
+        sag.append((engine.qpos[7:] - default)[spec.indices(["left_elbow", "right_elbow"])])
+    np.testing.assert_allclose(sag[1] / sag[0], 1.2, rtol=0.03)
+
+
+def test_rotors_keep_the_diagonal_of_the_inertia(spec):
+    """Of the arms at zero angles, against rotors at the joints."""
+    zero = torch.zeros(1, 2, 4, dtype=torch.float64)
+    diagonals = []
+    for robot in (spec, with_rotors(spec)):
+        pose = arm_chains(robot, torch.float64).pose(zero)
+        full = joint_inertia(arm_inertias(robot, torch.float64), pose)
+        diagonals.append(full.diagonal(dim1=-2, dim2=-1).numpy())
+    np.testing.assert_allclose(diagonals[1], diagonals[0], rtol=0.02)
+    given = rotor_inertias(spec)
+    assert given["left_ankle_link"] == given["right_hip_yaw_link"] == pytest.approx(spec.joint_armature)
+    assert given["left_knee_link"] == given["left_hip_pitch_link"] == pytest.approx(0.0, abs=1e-9)
+    assert given["left_shoulder_pitch_link"] == pytest.approx(0.0, abs=1e-6)  # oblique: elbow and shoulder yaw share it
+
+
+def test_an_engine_that_is_not_installed_is_named(spec, monkeypatch):
+    real = builtins.__import__
+
+    def without(name, *args, **kwargs):
+        if name.startswith("pybullet"):
+            raise ModuleNotFoundError(name)
+        return real(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(ModuleNotFoundError, match=r"pip install 'cotap\[pybullet\]'"):
+        make_engine(EngineConfig(engine="pybullet"), spec)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"engine": "mujuco"}, "did you mean 'mujoco'"),
+        ({"timestep": 0.1}, "timestep must lie in"),
+        ({"collision": "hands"}, "collision 'hands' is unknown"),
+        ({"cone": "round"}, "cone 'round' is unknown"),
+        ({"engine": "pybullet", "collision": "feet"}, "pybullet has full collision"),
+        ({"friction": 0.0}, "friction must lie in"),
+    ],
+)
+def test_bad_settings_are_named(fields, message, spec):
+    with pytest.raises(ValueError, match=message):
+        make_engine(EngineConfig(**fields), spec)

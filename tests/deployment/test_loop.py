@@ -1,0 +1,354 @@
+"""The loop around a policy: start-up, perturbations, safe stop, scenarios, reports, bad input."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+
+import numpy as np
+import onnx
+import pytest
+import torch
+
+from cotap.deploy import main as deploy
+from cotap.deployment.controller import Controller, Readings, law_config, measured, robot_of
+from cotap.deployment.engines import EngineConfig, make_engine
+from cotap.deployment.joint_law import JointLaw, damped_law, pd_law
+from cotap.deployment.keyboard import Stick
+from cotap.deployment.metadata import PolicyError
+from cotap.deployment.robot import Perturbations, Robot
+from cotap.deployment.safety import SafetyConfig, Watchdog
+from cotap.deployment.scenario import ArmMotion, Scenario, TimedCommand, load_scenario
+from cotap.deployment.trial import Trial, run_trial, start_up, trajectory
+from cotap.envs.commands import CommandConfig
+from cotap.envs.forces import ForceProfile
+from cotap.envs.upper_body import UpperBodyConfig
+
+FAST = EngineConfig(timestep=0.01, collision="feet", cone="pyramidal")
+FREE = np.zeros((2, 3))
+
+
+def make_robot(spec, perturbations: Perturbations | None = None) -> Robot:
+    return Robot(make_engine(FAST, spec), FAST, spec, 0.02, perturbations or Perturbations())
+
+
+def make_controller(policy, spec, laws: UpperBodyConfig | None = None, seed: int = 0) -> Controller:
+    motion = ArmMotion().reference(spec, 0.02)
+    return Controller(policy, spec, laws or UpperBodyConfig(), CommandConfig(steady_rad=0.2), motion, seed)
+
+
+@pytest.fixture
+def default(spec):
+    return np.array([j.default_rad for j in spec.joints])
+
+
+def test_the_controller_sees_nothing_that_a_robot_does_not_measure(policy, spec):
+    """Readings hold NaN for the rest, and NaN would spread into every law."""
+    laws = UpperBodyConfig()
+    laws.left.name = "cotap"
+    robot, controller = make_robot(spec), make_controller(policy, spec, laws)
+    start_up(robot, controller, SafetyConfig(ramp_s=0.0), 0)
+    for _ in range(3):
+        readings = robot.read()
+        assert torch.isnan(readings.state.torso_pos_w).all()
+        assert torch.isnan(readings.state.torso_linear_velocity_h).all()
+        law = controller.step(readings)
+        assert np.isfinite(law.bias).all()
+        assert np.isfinite(law.stiffness).all()
+        robot.act(law, FREE)
+    laws.torso.model = "support"
+    with pytest.raises(ValueError, match="foot contacts"):
+        make_controller(policy, spec, laws)
+
+
+def test_laws_of_joints_are_affine_torques():
+    kp, kd = np.array([10.0, 20.0]), np.array([1.0, 2.0])
+    law = pd_law(kp, kd, np.array([0.5, -0.5]))
+    q, dq = np.array([0.1, 0.2]), np.array([0.3, -0.4])
+    np.testing.assert_allclose(law.torque(q, dq), [10.0 * 0.4 - 0.3, -20.0 * 0.7 + 0.8])
+    np.testing.assert_allclose(law.ramped(0.25).torque(q, dq), [0.25 * 4.0 - 0.3, -0.25 * 14.0 + 0.8])
+    np.testing.assert_allclose(damped_law(kd).torque(q, dq), [-0.3, 0.8])
+
+
+def test_gains_ramp_while_the_base_is_held(policy, spec):
+    robot, controller = make_robot(spec, Perturbations(start_error=0.1)), make_controller(policy, spec)
+    robot.start(np.array([j.default_rad for j in spec.joints]), seed=3)
+    wrong = robot.engine.qpos.copy()
+    torques = []
+    act = robot.act
+    robot.act = lambda law, force, at_once=False: (torques.append(law.stiffness[0, 0]), act(law, force, at_once))[1]
+    start_up(robot, controller, SafetyConfig(ramp_s=1.0, settle_s=0.5), 3)
+    assert len(torques) == 75
+    assert torques[0] == pytest.approx(150.0 / 50.0)
+    assert torques[49:] == pytest.approx([150.0] * 26)
+    np.testing.assert_allclose(robot.engine.qpos[:7], wrong[:7], atol=2e-3)  # held as it was, tilt and all
+    assert 0.01 < np.abs(wrong[4:6]).max() < 0.06
+    joints = np.array([j.default_rad for j in spec.joints])
+    assert np.abs(wrong[7:] - joints).max() > 0.08
+    assert np.abs(robot.engine.qpos[18:] - joints[11:]).max() < 0.02  # arms brought to the pose, but for gravity
+    robot.act(robot.holding(joints), FREE)
+    before = robot.engine.qpos[2]
+    for _ in range(4):
+        robot.act(robot.holding(joints), FREE)
+    assert robot.engine.qpos[2] < before - 5e-4  # let go
+
+
+def test_laws_are_late_by_the_delay_but_a_stop_is_not(spec, default):
+    robot = make_robot(spec, Perturbations(delay_steps=(2, 2)))
+    robot.start(default, 0)
+    laws = [pd_law(np.zeros(19), np.zeros(19), np.zeros(19)) for _ in range(3)]
+    marked = [JointLaw(law.bias + i + 1.0, law.stiffness, law.damping) for i, law in enumerate(laws)]
+    felt = []
+    for law in marked:
+        robot.act(law, FREE)
+        felt.append(robot.torque()[0])
+    assert abs(felt[0]) < 10.0
+    assert felt[0] != pytest.approx(1.0)
+    assert felt[2] == pytest.approx(1.0)
+    robot.act(damped_law(np.zeros(19)), FREE, at_once=True)
+    assert robot.torque()[0] == 0.0
+
+
+def test_readings_are_lost_and_noisy_as_told(spec, default):
+    robot = make_robot(spec, Perturbations(drop=0.3, encoder_noise=0.01, velocity_noise=0.5))
+    robot.start(default, 0)
+    robot.engine.hold(True)
+    errors, rates, lost, last = [], [], 0, None
+    for _ in range(300):
+        readings = robot.read()
+        if readings is last:
+            lost += 1
+        else:
+            errors.append(readings.state.joint_pos[0].numpy() - robot.engine.qpos[7:])
+            rates.append(readings.state.joint_vel[0].numpy() - robot.engine.qvel[6:])
+        last = readings
+    assert lost == pytest.approx(90, abs=30)
+    assert np.abs(errors).max() == pytest.approx(0.01, rel=0.02)
+    assert np.std(errors) == pytest.approx(0.01 / np.sqrt(3.0), rel=0.05)
+    assert np.abs(rates).max() == pytest.approx(0.5, rel=0.02)
+
+
+def test_masses_are_wrong_by_the_share_in_both_directions(spec, default):
+    robot = make_robot(spec, Perturbations(mass_error=0.2))
+    found = set()
+    for seed in range(8):
+        robot.start(default, seed)
+        found.add(round(float(robot.engine.model.body_mass.sum() / 51.437), 3))
+    assert found == {0.8, 1.2}
+
+
+def readings_of(robot: Robot, **changes) -> Readings:
+    readings = robot.read()
+    state = measured(readings.state, **{k: v for k, v in changes.items() if k != "torque"})
+    return Readings(state, changes.get("torque", readings.torque))
+
+
+def test_the_watchdog_names_what_it_stops_for(spec, default):
+    robot = make_robot(spec)
+    robot.start(default, 0)
+    law = robot.holding(default)
+    limit = robot.torque_limit
+
+    def fresh():
+        return Watchdog(SafetyConfig(), spec.joint_names, limit, 0.02)
+
+    assert fresh().reason(robot.read(), law) == ""
+    nan = robot.read().state.joint_vel.clone()
+    nan[0, 3] = torch.nan
+    assert "reading is not finite" in fresh().reason(readings_of(robot, joint_vel=nan), law)
+    bad = JointLaw(law.bias * np.nan, law.stiffness, law.damping)
+    assert "policy's output is not finite" in fresh().reason(robot.read(), bad)
+    down = torch.tensor([[0.9, 0.0, -0.436]], dtype=torch.float64)
+    assert "tilted by 1.12 rad" in fresh().reason(readings_of(robot, projected_gravity_t=down), law)
+    dog, torque = fresh(), np.zeros(19)
+    torque[spec.joint_names.index("left_elbow")] = -limit[-5]
+    for _ in range(49):
+        assert dog.reason(readings_of(robot, torque=torque), law) == ""
+    assert dog.reason(readings_of(robot, torque=0.9 * torque), law) == ""  # a breath, and counting starts anew
+    for _ in range(49):
+        assert dog.reason(readings_of(robot, torque=torque), law) == ""
+    assert "left_elbow is at its torque limit for 1.00 s" in dog.reason(readings_of(robot, torque=torque), law)
+
+
+def test_a_policy_that_breaks_is_stopped_damped_and_counted(policy, spec):
+    class Broken:
+        metadata = policy.metadata
+        calls = 0
+
+        def __call__(self, observation):
+            self.calls += 1
+            targets, action = policy(observation)
+            return (targets * np.nan if self.calls > 10 else targets), action
+
+    robot, controller = make_robot(spec), make_controller(Broken(), spec)
+    command = TimedCommand(stand=True)
+    trial = run_trial(robot, controller, Scenario(5.0, command=(command,)), SafetyConfig(ramp_s=0.0))
+    assert trial.stopped == "the policy's output is not finite"
+    assert trial.stopped_at_s == pytest.approx(0.2)
+    assert trial.fell
+    assert len(trial.rows) == 10 + 50  # and a second of what followed
+    assert np.isfinite(np.stack(trial.qpos)).all()
+    assert trial.qpos[-1][2] < 0.8  # it sank
+    assert np.abs(robot.engine.qvel).max() < 8.0  # and did not thrash
+
+
+def test_it_walks_where_it_is_told_and_feels_the_forces(policy, spec):
+    scenario = Scenario(
+        4.0,
+        command=(TimedCommand(stand=True), TimedCommand(at=0.5, velocity=(0.6, 0.0))),
+        force=(ForceProfile((0.0, 0.0, -10.0), "left", 3.0),),
+    )
+    robot, controller = make_robot(spec), make_controller(policy, spec)
+    trial = run_trial(robot, controller, scenario, SafetyConfig())
+    assert not trial.fell
+    t = trajectory([trial], 200)
+    assert t.velocity[100:, 0, 0].mean() == pytest.approx(0.6, abs=0.12)
+    assert t.command[-1, 0].tolist() == pytest.approx([0.6, 0.0, 0.0])
+    assert t.stand[:20].all()
+    before, after = (t.hand_error[k, 0, 0].mean() for k in (slice(100, 150), slice(170, 200)))
+    assert after > before + 0.005
+
+
+def test_a_short_trial_is_padded_as_fallen(policy, spec):
+    robot, controller = make_robot(spec), make_controller(policy, spec)
+    trial = run_trial(robot, controller, Scenario(0.2, command=(TimedCommand(stand=True),)), SafetyConfig(ramp_s=0.0))
+    cut = Trial(trial.dt, trial.rows[:5], fell=True)
+    cut.rows[-1] = cut.rows[-1] | {"fell": torch.tensor([True])}
+    t = trajectory([trial, cut], 10)
+    assert t.velocity.shape == (10, 2, 3)
+    assert t.alive().tolist() == [[True, k < 4] for k in range(10)]
+
+
+SCENARIO = """
+seconds = 1.0
+left = "cotap:alpha=0.7,stiffness=500"
+right = "pd"
+[arms]
+pose = [0.1, 0.2, 0.0, 0.3, 0.1, -0.2, 0.0, 0.3]
+[[command]]
+velocity = [0.4, 0.0]
+[[command]]
+at = 0.5
+stand = true
+height_offset = -0.1
+[[force]]
+hand = "both"
+force = [0.0, 0.0, -30.0]
+start_s = 0.2
+period_s = 4.0
+"""
+
+
+def test_a_scenario_is_read_and_run(policy_file, tmp_path, spec, capsys):
+    path, out = tmp_path / "s.toml", tmp_path / "r.json"
+    path.write_text(SCENARIO)
+    scenario = load_scenario(path, spec)
+    assert scenario.command[1] == TimedCommand(at=0.5, stand=True, height_offset=-0.1)
+    assert scenario.force[0] == ForceProfile((0.0, 0.0, -30.0), "both", 0.2, period_s=4.0)
+    args = ["--policy", str(policy_file), "--scenario", str(path), "--json", str(out), "--timestep", "0.01",
+            "--collision", "feet", "--trials", "2", "--start-error", "0.02", "--drop", "0.05"]  # fmt: skip
+    assert deploy(args) == 0
+    assert "0 of 2 trials fell" in capsys.readouterr().out
+    result = json.loads(out.read_text())
+    assert (result["num_trials"], result["num_falls"], result["engine"]) == (2, 0, "mujoco")
+    assert result["settings"]["laws"]["left"]["alpha"] == 0.7
+    assert result["settings"]["perturbations"]["drop"] == 0.05
+    assert result["metrics"]["e_lin"]["mean"] is None or result["metrics"]["e_lin"]["mean"] < 1.0
+    assert [t["seconds"] for t in result["trials"]] == pytest.approx([1.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("seconds = ", "is not TOML"),
+        ("speed = 1", "has no field 'speed'"),
+        ("seconds = -1", "seconds must lie in"),
+        ("seconds = 'long'", "seconds must be a finite number"),
+        ("command = 3", "command must be a list of tables"),
+        ("arms = 'up'", "arms must be a table"),
+        ("[[command]]\nvelocity = [1.0]", r"command\[0\].velocity must hold 2 numbers"),
+        ("[[command]]\nstand = 1", "stand must be true or false"),
+        ("[[command]]\nstand = true\nvelocity = [0.1, 0.0]", "stands and moves"),
+        ("[[command]]\nat = 2\n[[command]]\nat = 1", "before the one ahead"),
+        ("[[force]]\nforce = [1, 2, 3]\nhand = 'foot'", "force.hand 'foot' is unknown"),
+        ("[arms]\npose = [9, 0, 0, 0, 0, 0, 0, 0]", "left_shoulder_pitch.*must lie in"),
+        ("[arms]\nclip = 'moonwalk'", "moonwalk"),
+        ("left = 'rubber'", "--left 'rubber' is unknown"),
+    ],
+)
+def test_bad_scenarios_are_named(text, message, policy_file, tmp_path, capsys):
+    path = tmp_path / "s.toml"
+    path.write_text(text)
+    assert deploy(["--policy", str(policy_file), "--scenario", str(path)]) == 2
+    assert re.search(message, capsys.readouterr().err)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--trials", "0"], "trials must be a positive integer"),
+        (["--scenario", "none.toml"], "'none.toml' does not exist"),
+        (["--timestep", "0.003"], "timestep must divide the control step"),
+        (["--delay-steps", "2", "1"], "delay_steps must be integers"),
+        (["--mass-error", "1.5"], "mass_error must lie in"),
+        (["--json", "nowhere/x.json"], "its folder does not exist"),
+        (["--keyboard", "--trials", "3"], "--keyboard goes with neither"),
+        (["--keyboard"], "needs a terminal"),
+        (["--left", "cotap:alpha=2"], "alpha must lie in"),
+        (["--engine", "isaac"], "engine 'isaac' is unknown"),
+    ],
+)
+def test_bad_options_are_named(arguments, message, policy_file, capsys):
+    assert deploy(["--policy", str(policy_file), *arguments]) == 2
+    assert message in capsys.readouterr().err
+
+
+def _edited(policy_file, tmp_path, name, value):
+    proto = onnx.load(policy_file)
+    next(p for p in proto.metadata_props if p.key == name).value = json.dumps(value)
+    onnx.save(proto, tmp_path / "other.onnx")
+    return tmp_path / "other.onnx"
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("robot", "g1", "for the robot 'g1'; known: h1"),
+        ("joints", [f"joint_{i}" for i in range(19)], "other joints"),
+        ("kp", [100.0] * 19, "other kp"),
+        ("commands", {"gait": 1.0}, "no field 'gait'"),
+        ("law", {"left": {"name": "jelly"}, "right": {}, "ranges": None}, "'jelly' is unknown"),
+    ],
+)
+def test_policies_of_another_robot_are_refused(name, value, message, policy_file, tmp_path, capsys):
+    assert deploy(["--policy", str(_edited(policy_file, tmp_path, name, value)), "--seconds", "0.1"]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_the_trained_law_is_the_default(policy):
+    law = dict(policy.metadata.law)
+    law["right"] = law["right"] | {"name": "cotap", "stiffness": [200.0, 300.0, 400.0]}
+    laws = law_config(dataclasses.replace(policy.metadata, law=law))
+    assert laws.left.name == "pd"
+    assert (laws.right.name, laws.right.stiffness) == ("cotap", (200.0, 300.0, 400.0))
+    with pytest.raises(PolicyError, match="h2"):
+        robot_of(dataclasses.replace(policy.metadata, robot="h2"))
+
+
+def test_keys_build_up_commands():
+    stick = Stick()
+    for key in "wwwa":
+        command = stick.press(key)
+    assert (command.velocity, command.yaw_rate, command.stand) == ((0.3, 0.0), 0.1, False)
+    for _ in range(20):
+        command = stick.press("s")
+    assert command.velocity == (-1.0, 0.0)
+    command = stick.press("f")
+    assert (command.stand, command.height_offset, command.velocity) == (True, -0.02, (0.0, 0.0))
+    command = stick.press(" ")
+    assert command == TimedCommand(stand=True)
+    command.check("key")
+    assert not stick.ended
+    stick.press("x")
+    assert stick.ended

@@ -1,0 +1,86 @@
+"""The comparison of engines: its arithmetic by hand, and one whole small run."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from cotap.compliance.laws import LawConfig
+from cotap.deployment import sim_to_sim
+from cotap.deployment.robot import Perturbations
+from cotap.deployment.sim_to_sim import Comparison, falls, statics, swing
+from cotap.deployment.trial import Trial
+from cotap.envs.upper_body import UpperBodyConfig
+
+SCRIPT = Path(__file__).parents[2] / "scripts" / "sim_to_sim.py"
+
+
+@pytest.fixture
+def script(monkeypatch):
+    module = importlib.util.module_from_spec(found := importlib.util.spec_from_file_location("sim_to_sim", SCRIPT))
+    monkeypatch.setitem(sys.modules, "sim_to_sim", module)  # where dataclasses look for their annotations
+    found.loader.exec_module(module)
+    return module
+
+
+def test_rates_of_falls_have_wilsons_interval():
+    """2 of 100: 0.0055 to 0.0700; 0 of 20 still leaves 0.16 open."""
+    two = falls([Trial(0.02, fell=i < 2) for i in range(100)])
+    assert two["ci95"] == pytest.approx([0.0055, 0.0700], abs=1e-4)
+    assert falls([Trial(0.02) for _ in range(20)])["ci95"] == pytest.approx([0.0, 0.1611], abs=1e-4)
+
+
+def test_swings_are_found_beside_drift_and_offset():
+    time = 0.02 * np.arange(400)
+    values = 3.0 + 0.1 * time + 0.7 * np.sin(2.0 * np.pi * time / 4.0 + 1.0)
+    assert swing(values, 0.02, 4.0) == pytest.approx(0.7, rel=1e-6)
+
+
+def test_statics_is_jacobian_transpose_and_compliance(spec, model):
+    """PD: `J^T F` at the elbow, and `J J^T / kp` at the hand, by MuJoCo's Jacobian."""
+    qpos = np.array([0.0, 0.0, 1.02, 1.0, 0.0, 0.0, 0.0, *(j.default_rad for j in spec.joints)])
+    qpos[-5:] += 0.3
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_forward(model, data)
+    laws = UpperBodyConfig(LawConfig("cotap", alpha=0.0), LawConfig("pd"))
+    for arm, (torque, moved) in zip(spec.arms, statics(spec, laws, qpos, 30.0), strict=True):
+        hand, jacobian = data.body(arm.hand_body), np.zeros((3, model.nv))
+        point = hand.xpos + hand.xmat.reshape(3, 3) @ arm.hand_point
+        mujoco.mj_jac(model, data, jacobian, None, point, hand.id)
+        row = jacobian[2, [model.joint(name).dofadr[0] for name in arm.joints]]
+        assert torque == pytest.approx(30.0 * abs(row[-1]), rel=1e-6)
+        assert moved == pytest.approx(30.0 * float(row @ row) / 100.0, rel=1e-6)
+
+
+@pytest.mark.slow
+def test_a_small_comparison_is_written_whole(policy_file, tmp_path, monkeypatch, script):
+    monkeypatch.setattr(sim_to_sim, "LAWS", {"PD": "pd"})
+    monkeypatch.setattr(sim_to_sim, "PERTURBATIONS", {"late": Perturbations(delay_steps=(1, 1))})
+    arguments = ["--policy", str(policy_file), "--engines", "mujoco", "--trials", "1", "--perturbed-trials", "1",
+                 "--load-trials", "1", "--seconds", "2", "--timestep", "0.01", "--output", str(tmp_path)]  # fmt: skip
+    assert script.main(arguments) == 0
+    result = json.loads((tmp_path / "report.json").read_text())
+    load = result["engines"]["mujoco"]["periodic-load"]["arms"]["right"]
+    assert load["elbow_torque_nm"] == pytest.approx(load["elbow_torque_statics_nm"], rel=0.1)
+    assert result["engines"]["mujoco"]["constant-load"]["PD"]["displacement_z"] < -0.03
+    assert "| late | 0 of 1" in (tmp_path / "report.md").read_text()
+    assert (tmp_path / "report.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_bad_comparisons_are_named(policy_file, script, capsys):
+    for arguments, message in (
+        (["--engines", "newton"], "engine 'newton' is unknown"),
+        (["--trials", "0"], "trials must be a positive integer"),
+        (["--seconds", "1"], "seconds must lie in"),
+    ):
+        assert script.main(["--policy", str(policy_file), *arguments]) == 2
+        assert message in capsys.readouterr().err
+    with pytest.raises(ValueError, match="at least one engine"):
+        Comparison(engines=()).check()
