@@ -152,7 +152,7 @@ def damaged(checkpoint: Path, kind: str) -> tuple[Path, list[str]]:
     if kind == "missing":
         return path, ["does not exist"]
     if kind == "folder":
-        return checkpoint.parent, ["does not exist"]
+        return checkpoint.parent, ["is no file"]
     if kind == "truncated":
         path.write_bytes(checkpoint.read_bytes()[:-1000])
         return path, ["truncated"]

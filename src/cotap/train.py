@@ -7,6 +7,7 @@ import platform
 import subprocess
 import sys
 import time
+import traceback
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -83,7 +84,7 @@ class PipelineOptions:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Parse, train, report. Returns the exit status: 0, or 2 for bad input."""
+    """Parse, train, report. Returns the exit status: 0, 2 for bad input, 1 for a training that failed."""
     args = list(sys.argv[1:] if argv is None else argv)
     stage = args.pop(0) if args and not args[0].startswith("-") else ""
     try:
@@ -100,6 +101,10 @@ def main(argv: list[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except RuntimeError as error:  # an iteration failed, or the frozen base was found changed
+        traceback.print_exception(error.__cause__ or error)
+        print(f"error: {error}", file=sys.stderr)
+        return 1
     except KeyboardInterrupt:  # asked to stop twice
         print("interrupted before the checkpoint was saved; the last one is whole", file=sys.stderr)
         return 130

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import io
 import json
 import os
 import tempfile
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -41,6 +43,26 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
         with contextlib.suppress(OSError):
             temporary.unlink()
         raise
+    _sync_folder(path.parent)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make a rename last through a power cut, where the system can."""
+    with contextlib.suppress(OSError):  # Windows opens no folders, and some file systems sync none
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+
+
+def remove_leftovers(folder: Path) -> int:
+    """Delete the temporary files that processes killed while saving have left in a run's folder. Returns how many."""
+    leftovers = [*folder.glob(".checkpoint_*.pt"), *folder.glob(".config.*.json")]
+    for path in leftovers:
+        with contextlib.suppress(OSError):
+            path.unlink()
+    return len(leftovers)
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -73,10 +95,17 @@ def load_checkpoint(path: Path | str, device: str = "cpu") -> dict[str, Any]:
         CheckpointError: the file is missing, truncated, foreign, or of another version.
     """
     path = Path(path)
-    if not path.is_file():
-        raise CheckpointError(f"checkpoint {str(path)!r} does not exist")
     try:
-        content = torch.load(path, map_location=device, weights_only=True)
+        if not path.is_file():
+            raise CheckpointError(f"checkpoint {str(path)!r} {'is no file' if path.exists() else 'does not exist'}")
+        data = path.read_bytes()
+    except (OSError, ValueError) as error:
+        if isinstance(error, CheckpointError):
+            raise
+        raise CheckpointError(f"checkpoint {str(path)!r} cannot be opened or read from disk: {error}") from error
+    try:
+        _refuse_compressed(data)
+        content = torch.load(io.BytesIO(data), map_location=device, weights_only=True)
     except Exception as error:  # on rubbish, torch's restricted unpickler raises whatever its reading stumbles over
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise CheckpointError(f"checkpoint {str(path)!r} cannot be read (truncated or foreign): {reason}") from error
@@ -85,6 +114,14 @@ def load_checkpoint(path: Path | str, device: str = "cpu") -> dict[str, Any]:
     if content.get("version") != VERSION:
         raise CheckpointError(f"{str(path)!r} has version {content.get('version')!r}; this cotap reads {VERSION}")
     return content
+
+
+def _refuse_compressed(data: bytes) -> None:
+    """Torch writes archives uncompressed; one that is compressed could unpack to more than any memory holds."""
+    if zipfile.is_zipfile(io.BytesIO(data)):
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            if any(entry.file_size > len(data) for entry in archive.infolist()):
+                raise ValueError("an entry unpacks to more than the whole file holds")
 
 
 def require_layout(path: Path | str, saved: dict[str, Any], present: dict[str, Any]) -> None:

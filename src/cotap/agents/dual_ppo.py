@@ -211,7 +211,8 @@ class DualPPO:
         self._step = 0
 
     def update(self) -> dict[str, float]:
-        """Learn from the rollout. Returns mean losses, KL and learning rate per agent, for the log."""
+        """Learn from the rollout. Returns mean losses, KL and learning rate per agent, and how many steps were skipped
+        because their gradient was not finite, for the log."""
         r, cfg = self.rollout, self.cfg
         flat = {
             key: getattr(r, key).flatten(0, 1)
@@ -223,6 +224,7 @@ class DualPPO:
         old_log_std = {n: self.model.log_std[n].detach().clone() for n in self.names}
         total = flat["actions"].shape[0]
         sums: dict[str, torch.Tensor] = {}
+        skipped = dict.fromkeys(self.names, 0)
         for _ in range(cfg.epochs):
             for ids in torch.randperm(total, device=self.device).chunk(cfg.mini_batches):
                 batch = {key: value[ids] for key, value in flat.items()}
@@ -231,13 +233,17 @@ class DualPPO:
                     actor_in, critic_in = self.model.read("actor", inputs), self.model.read("critic", inputs)
                 for g, name in enumerate(self.names):
                     stats = self._update_agent(name, g, actor_in, critic_in, batch, old_log_std[name])
+                    if stats is None:
+                        skipped[name] += 1
+                        continue
                     for key, value in stats.items():
                         sums[f"{name}/{key}"] = sums.get(f"{name}/{key}", torch.zeros(())) + value
         self.iterations += 1
         self._limit_std()
-        count = cfg.epochs * cfg.mini_batches
-        log = {key: float(value) / count for key, value in sums.items()}
+        count = {name: max(1, cfg.epochs * cfg.mini_batches - skipped[name]) for name in self.names}
+        log = {key: float(value) / count[key.partition("/")[0]] for key, value in sums.items()}
         for name in self.names:
+            log[f"{name}/skipped"] = float(skipped[name])
             log[f"{name}/learning_rate"] = self.learning_rates[name]
             if self.guide and name in self.guide.cfg.agents:
                 log[f"{name}/base_beta"] = self.guide.beta(self.iterations - 1)
@@ -254,7 +260,8 @@ class DualPPO:
     def _update_agent(
         self, name: str, g: int, actor_in: torch.Tensor, critic_in: torch.Tensor, batch: dict[str, torch.Tensor],
         old_log_std: torch.Tensor,
-    ) -> dict[str, torch.Tensor]:  # fmt: skip
+    ) -> dict[str, torch.Tensor] | None:  # fmt: skip
+        """Statistics of the step, or None if its gradient is not finite and nothing was learned from it."""
         cfg, model = self.cfg, self.model
         part = self.layout.action_slices[name]
         with self._autocast():
@@ -279,8 +286,10 @@ class DualPPO:
         optimizer = self.optimizers[name]
         optimizer.zero_grad()
         loss.backward()
-        nn.utils.clip_grad_norm_([*model.actors[name].parameters(), log_std], cfg.max_grad_norm)
-        nn.utils.clip_grad_norm_(model.critics[name].parameters(), cfg.max_grad_norm)
+        norm = nn.utils.clip_grad_norm_([*model.actors[name].parameters(), log_std], cfg.max_grad_norm)
+        norm += nn.utils.clip_grad_norm_(model.critics[name].parameters(), cfg.max_grad_norm)
+        if not torch.isfinite(norm):
+            return None
         for group in optimizer.param_groups:
             group["lr"] = self.learning_rates[name]
         optimizer.step()

@@ -14,13 +14,20 @@ from typing import Any
 import torch
 from rsl_rl.env import VecEnv
 from rsl_rl.runners import OnPolicyRunner
-from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-from cotap.agents.actors import AgentLayout, as_dict
-from cotap.agents.checkpoint import CheckpointError, load_checkpoint, require_layout, save_checkpoint, write_json
+from cotap.agents.actors import AgentLayout, Observations, as_dict
+from cotap.agents.checkpoint import (
+    CheckpointError,
+    load_checkpoint,
+    remove_leftovers,
+    require_layout,
+    save_checkpoint,
+    write_json,
+)
 from cotap.agents.distillation import Guide
 from cotap.agents.dual_ppo import DualPPO, DualPPOConfig
+from cotap.agents.run_log import RunLog
 from cotap.checks import require_positive_int
 
 CHECKPOINT_PATTERN = "checkpoint_*.pt"
@@ -67,6 +74,10 @@ def check_run_dir(run_dir: Path, resuming: bool) -> None:
     probe.unlink()
 
 
+class TrainingFault(RuntimeError):
+    """An iteration that could not be finished; the message says why, and what to go on from."""
+
+
 class DualRunner(OnPolicyRunner):
     """rsl_rl's runner for two agents. Replaces its loop, its saving (all that a run depends on) and its loading
     (no code is run from a file); needs an environment with `action_slices`, `obs_groups` and `state_dict`.
@@ -90,62 +101,106 @@ class DualRunner(OnPolicyRunner):
         self.alg: DualPPO = DualPPO(layout_of(env, ppo.symmetric), env.num_envs, ppo, device, guide)  # pyright: ignore
         self.current_learning_iteration = 0
         self.wall_seconds = 0.0
-        self._stop = False
+        self.failed_saves = 0
+        self._saved = -1
+        self._save_failed = self._stop = False
 
     def learn(self, num_learning_iterations: int | None = None, init_at_random_ep_len: bool = False) -> None:
-        """Train up to `runner.iterations` in all (or for so many more), saving at intervals and at the end."""
+        """Train up to `runner.iterations` in all (or for so many more), saving at intervals and at the end.
+
+        A save that fails (a full disk) is reported and tried again after every iteration; worlds that diverge and
+        steps that are skipped are reported as they are counted.
+
+        Raises:
+            TrainingFault: an iteration failed; the message says what to go on from.
+            OSError: the last save failed, or logs cannot be written from the start.
+        """
         env, alg = self.env, self.alg
         self._stop = False
         first = self.current_learning_iteration
         last = self.runner_cfg.iterations if num_learning_iterations is None else first + num_learning_iterations
         if init_at_random_ep_len and first == 0:
             env.episode_length_buf = torch.randint_like(env.episode_length_buf, high=int(env.max_episode_length))
+        remove_leftovers(self.run_dir)
         write_json(self.run_dir / "config.json", self.config)
-        writer = SummaryWriter(str(self.run_dir), purge_step=env.samples + 1)  # pyright: ignore[reportAttributeAccessIssue]
+        run_log = RunLog(self.run_dir, env.samples)  # pyright: ignore[reportAttributeAccessIssue]
         precision = str(alg.dtype).removeprefix("torch.")
         tqdm.write(f"{env.num_envs} worlds, networks {alg.cfg.hidden} in {precision} on {self.device}, {self.run_dir}")
         obs = self._observations()
-        saved = -1
+        self._saved = -1
         with self._signals(), tqdm(total=last, initial=first, unit="it", dynamic_ncols=True) as bar:
             for it in range(first, last):
-                start = time.perf_counter()
-                log: dict[str, torch.Tensor] = {}
-                for _ in range(alg.cfg.steps):
-                    _, _, dones, extras = env.step(alg.act(obs).to(env.device))
-                    obs = self._observations()
-                    alg.process_step(
-                        extras["group_rewards"].to(self.device),
-                        dones.to(self.device),
-                        extras["time_outs"].to(self.device),
-                    )
-                    for key, value in extras["log"].items():
-                        log[key] = log.get(key, torch.zeros(())) + value
-                alg.compute_returns(obs)
-                collected = time.perf_counter()
-                scalars = {key.lstrip("/"): float(value) / alg.cfg.steps for key, value in log.items()}
-                scalars |= {f"agents/{key}": value for key, value in alg.update().items()}
-                end = time.perf_counter()
-                self.wall_seconds += end - start
-                batch = alg.cfg.steps * env.num_envs
-                scalars |= {
-                    "throughput/steps_per_s": batch / (end - start),
-                    "throughput/collect_s": collected - start,
-                    "throughput/learn_s": end - collected,
-                }
+                try:
+                    obs, scalars = self._iterate(obs)
+                except Exception as error:
+                    raise TrainingFault(self._fault(error)) from error
                 self.current_learning_iteration = it + 1
-                for key, value in scalars.items():
-                    writer.add_scalar(key, value, env.samples)  # pyright: ignore[reportAttributeAccessIssue]
+                scalars |= {"faults/failed_saves": self.failed_saves, "faults/lost_log_records": run_log.lost}
+                if reason := run_log.write(scalars, env.samples):  # pyright: ignore[reportAttributeAccessIssue]
+                    tqdm.write(f"iteration {it + 1}: its log record could not be written ({reason})")
                 bar.update()
                 bar.set_postfix_str(_summary(scalars))
-                if (it + 1) % self.runner_cfg.save_interval == 0:
-                    self.save()
-                    saved = it + 1
+                if (it + 1) % self.runner_cfg.save_interval == 0 or self._save_failed:
+                    self._save_or_report()
                 if self._stop:
                     tqdm.write("stopping: saving a checkpoint")
                     break
-            if saved != self.current_learning_iteration:
+            if self._saved != self.current_learning_iteration:
                 self.save()
-        writer.close()
+        run_log.close()
+
+    def _iterate(self, obs: Observations) -> tuple[Observations, dict[str, float]]:
+        """Collect a rollout and learn from it. Returns the observations after it, and what to log."""
+        env, alg = self.env, self.alg
+        start = time.perf_counter()
+        diverged = getattr(env, "num_diverged", 0)
+        log: dict[str, torch.Tensor] = {}
+        for _ in range(alg.cfg.steps):
+            _, _, dones, extras = env.step(alg.act(obs).to(env.device))
+            obs = self._observations()
+            alg.process_step(
+                extras["group_rewards"].to(self.device), dones.to(self.device), extras["time_outs"].to(self.device)
+            )
+            for key, value in extras["log"].items():
+                log[key] = log.get(key, torch.zeros(())) + value
+        alg.compute_returns(obs)
+        collected = time.perf_counter()
+        scalars = {key.lstrip("/"): float(value) / alg.cfg.steps for key, value in log.items()}
+        learned = alg.update()
+        scalars |= {f"agents/{key}": value for key, value in learned.items()}
+        end = time.perf_counter()
+        self.wall_seconds += end - start
+        scalars |= {
+            "throughput/steps_per_s": alg.cfg.steps * env.num_envs / (end - start),
+            "throughput/collect_s": collected - start,
+            "throughput/learn_s": end - collected,
+        }
+        self._report(getattr(env, "num_diverged", 0) - diverged, learned)
+        return obs, scalars
+
+    def _report(self, diverged: int, learned: dict[str, float]) -> None:
+        """Name in the log what went wrong in an iteration and was contained."""
+        where = f"iteration {self.current_learning_iteration + 1}"
+        if diverged:
+            tqdm.write(f"{where}: worlds diverged {diverged} times; each was ended, counted and started again")
+        for name in self.alg.names:
+            if skipped := learned[f"{name}/skipped"]:
+                tqdm.write(f"{where}: {skipped:.0f} steps of agent {name!r} skipped, their gradient was not finite")
+
+    def _fault(self, error: Exception) -> str:
+        newest = max(self.run_dir.glob(CHECKPOINT_PATTERN), default=None)
+        way_on = f"go on with --resume {newest}" if newest else "there is no checkpoint yet to go on from"
+        what = f"{type(error).__name__}: {error}"
+        return f"iteration {self.current_learning_iteration + 1} failed ({what}); {way_on}"
+
+    def _save_or_report(self) -> None:
+        """Save; if it fails, count it and say so: the run goes on, and every iteration tries again."""
+        try:
+            self.save()
+        except OSError as error:
+            self.failed_saves += 1
+            self._save_failed = True
+            tqdm.write(f"iteration {self.current_learning_iteration}: {error}; trying again after the next iteration")
 
     def save(self, path: str | None = None, infos: dict | None = None) -> None:
         """Save everything to go on exactly; the previous checkpoint then sheds its simulator states."""
@@ -153,6 +208,7 @@ class DualRunner(OnPolicyRunner):
             self.alg.guide.verify()
         target = Path(path) if path else self.run_dir / f"checkpoint_{self.current_learning_iteration:06d}.pt"
         save_checkpoint(target, self._content() | {"infos": infos or {}})
+        self._saved, self._save_failed = self.current_learning_iteration, False
         older = [path for path in self.run_dir.glob(CHECKPOINT_PATTERN) if path < target]
         if older:
             _shed_simulator_states(max(older))
@@ -232,13 +288,15 @@ class DualRunner(OnPolicyRunner):
 
 
 def _shed_simulator_states(path: Path) -> None:
-    """Only a run's newest checkpoint keeps them; a file that is no checkpoint is left as it is."""
+    """Only a run's newest checkpoint keeps them; a file that is no checkpoint, or cannot be replaced, is left."""
     try:
         content = load_checkpoint(path)
+        if content.get("env"):
+            save_checkpoint(path, content | {"env": {}})
     except CheckpointError:
         return
-    if content.get("env"):
-        save_checkpoint(path, content | {"env": {}})
+    except OSError as error:  # a disk that has just become full
+        tqdm.write(f"{path} keeps its simulator states: {error}")
 
 
 def _summary(s: dict[str, float]) -> str:
