@@ -160,15 +160,15 @@ def one_curve(folder: Path) -> bool:
 
 def kill_runs(work: Path, reference: Path, kills: int, pace: tuple[float, float], rng: random.Random) -> list[Row]:
     """Kill trainings `kills` times, a third of them during a save, and go on with each from what is left."""
-    kinds = ("at any moment", "during a save", "before a rename")
+    kinds = anywhere, saving, renaming = ("at any moment", "during a save", "before a rename")
     rows = {kind: Row(f"SIGKILL {kind}", 0, 0, 0, "") for kind in kinds}
     torn, ends, folder = 0, 0, work / "killed0"
     while sum(r.injected for r in rows.values()) < kills:
-        kind = rng.choice(kinds[:1] * 4 + kinds[1:])
-        run = Run(folder, _killed_at_rename(folder, rng.randint(1, 5)) if kind == kinds[2] else None)
-        if kind == kinds[0]:
+        kind = rng.choice([anywhere] * 4 + [saving, renaming])
+        run = Run(folder, _killed_at_rename(folder, rng.randint(1, 5)) if kind == renaming else None)
+        if kind == anywhere:
             _kill_after(run, rng.uniform(0.0, pace[0] + 5.0 * pace[1]))
-        elif kind == kinds[1]:
+        elif kind == saving:
             _kill_while_saving(run, rng)
         if run.wait() == -signal.SIGKILL:
             row = rows[kind]
@@ -185,8 +185,10 @@ def kill_runs(work: Path, reference: Path, kills: int, pace: tuple[float, float]
             folder = work / f"killed{ends}"
     _require_good_end(Run(folder), reference)
     ends += 1
-    rows[kinds[1]].outcome = f"{torn} of all kills left an unfinished file, none under a checkpoint's name"
-    rows[kinds[0]].outcome = f"{ends} runs gone on with to their end, bit for bit the undisturbed one, logs without gaps"
+    rows[saving].outcome = f"{torn} of all kills left an unfinished file, none under a checkpoint's name"
+    rows[
+        anywhere
+    ].outcome = f"{ends} runs gone on with to their end, bit for bit the undisturbed one; logs without gaps"
     return list(rows.values())
 
 
@@ -383,7 +385,7 @@ def full_disk(work: Path, reference: Path) -> list[Row]:
     text_ok = run.wait() == 0 and "trying again after the next iteration" in Path(run.log).read_text()
     failed = int(curve(folder, "faults/failed_saves")[-1][1])
     ok = text_ok and failed > 0 and same_end(folder, reference)
-    rows = [Row("disk full for six iterations", 1, int(ok), 0, f"{failed} saves failed, counted; ends bit for bit equal")]
+    rows = [Row("disk full for six iterations", 1, int(ok), 0, f"{failed} saves failed; ends bit for bit equal")]
 
     folder = disk / "for-good"
     shutil.rmtree(disk / "while")

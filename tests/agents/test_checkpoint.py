@@ -74,7 +74,7 @@ def test_a_file_that_the_system_does_not_read_is_called_that(good: Path, monkeyp
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 
     monkeypatch.setattr(Path, "read_bytes", fail)
-    with pytest.raises(CheckpointError, match="cannot be opened or read from disk: .*Input/output error") as error:
+    with pytest.raises(CheckpointError, match=r"cannot be opened or read from disk: .*Input/output error") as error:
         load_checkpoint(good)
     assert "truncated" not in str(error.value)
 

@@ -377,9 +377,9 @@ def test_a_step_that_raises_ends_the_run_with_what_to_do(tmp_path: Path):
             raise KeyError("a worker")
 
     runner.env.on_step = fail
-    with pytest.raises(TrainingFault, match=r"iteration 6 failed \(KeyError: 'a worker'\); go on with --resume") as error:
+    with pytest.raises(TrainingFault, match=r"iteration 6 failed \(KeyError: 'a worker'\)") as error:
         runner.learn()
-    assert str(checkpoint(tmp_path, 4)) in str(error.value)
+    assert f"go on with --resume {checkpoint(tmp_path, 4)}" in str(error.value)
     assert isinstance(error.value.__cause__, KeyError)
     assert load_checkpoint(checkpoint(tmp_path, 4))["env"] != {}
 
