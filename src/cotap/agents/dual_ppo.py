@@ -21,7 +21,8 @@ from cotap.agents.losses import (
     generalized_advantages,
 )
 from cotap.agents.precision import PRECISIONS, resolve_precision
-from cotap.checks import require_one_of, require_positive_int, require_range
+from cotap.agents.ranks import Ranks
+from cotap.checks import require_one_of, require_positive_int, require_range, require_shape
 
 
 @dataclass
@@ -116,14 +117,16 @@ class DualPPO:
         cfg: Hyperparameters.
         device: Where the networks live.
         guide: A frozen policy that agents are kept close to at first; None for none.
+        ranks: The processes that learn as one, each from its own `num_envs` worlds.
     """
 
     def __init__(
-        self, layout: AgentLayout, num_envs: int, cfg: DualPPOConfig, device: str = "cpu", guide: Guide | None = None
-    ) -> None:
+        self, layout: AgentLayout, num_envs: int, cfg: DualPPOConfig, device: str = "cpu", guide: Guide | None = None,
+        ranks: Ranks | None = None,
+    ) -> None:  # fmt: skip
         cfg.check()
         self.cfg, self.device, self.layout = cfg, device, layout
-        self.guide = guide
+        self.guide, self.ranks = guide, ranks or Ranks()
         self.dtype = resolve_precision(cfg.precision, device)
         self.names = tuple(layout.action_slices)
         self.model = DualActorCritic(layout, cfg.hidden, cfg.initial_std).to(device)
@@ -160,6 +163,7 @@ class DualPPO:
             rewards=buffer(g),
             dones=buffer(1, torch.bool),
         )
+        self._kl = nn.Parameter(torch.zeros(1, device=device))
         self._step = 0
         self.iterations = 0
 
@@ -206,8 +210,7 @@ class DualPPO:
             last = torch.cat([model.critics[n](x) for n in self.names], -1)
         advantages = generalized_advantages(r.rewards, r.values, last, r.dones, self.cfg.gamma, self.cfg.lam)
         r.returns = advantages + r.values
-        flat = advantages.flatten(0, 1)
-        r.advantages = (advantages - flat.mean(0)) / (flat.std(0) + 1e-8)
+        r.advantages = self.ranks.standardize(advantages.flatten(0, 1)).unflatten(0, advantages.shape[:2])
         self._step = 0
 
     def update(self) -> dict[str, float]:
@@ -270,7 +273,6 @@ class DualPPO:
         log_std = model.log_std[name]
         with torch.no_grad():
             kl = gaussian_kl(batch["means"][:, part], old_log_std, mean, log_std).mean()
-        self.learning_rates[name] = adapt_learning_rate(self.learning_rates[name], float(kl), cfg.desired_kl)
         log_prob = gaussian_log_prob(batch["actions"][:, part], mean, log_std)
         surrogate = clipped_surrogate(log_prob, batch["log_probs"][:, g], batch["advantages"][:, g], cfg.clip)
         value_loss = clipped_value_loss(value, batch["values"][:, g], batch["returns"][:, g], cfg.clip)
@@ -286,6 +288,10 @@ class DualPPO:
         optimizer = self.optimizers[name]
         optimizer.zero_grad()
         loss.backward()
+        own = [*model.actors[name].parameters(), log_std, *model.critics[name].parameters()]
+        self._kl.grad = kl.reshape(1)  # travels with the gradients: one message instead of two
+        self.ranks.average_gradients([*own, self._kl])
+        self.learning_rates[name] = adapt_learning_rate(self.learning_rates[name], float(self._kl.grad), cfg.desired_kl)
         norm = nn.utils.clip_grad_norm_([*model.actors[name].parameters(), log_std], cfg.max_grad_norm)
         norm += nn.utils.clip_grad_norm_(model.critics[name].parameters(), cfg.max_grad_norm)
         if not torch.isfinite(norm):
@@ -305,10 +311,16 @@ class DualPPO:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over what `state_dict` returned."""
+        """Take over what `state_dict` returned. Raises ValueError for moments of another size than the weights."""
         for name, opt in self.optimizers.items():
             opt.load_state_dict(state["optimizers"][name])
-        self.learning_rates = dict(state["learning_rates"])
-        self.iterations = state["iterations"]
+            for parameter, moments in opt.state.items():
+                for key in ("exp_avg", "exp_avg_sq"):
+                    require_shape(f"optimizers.{name}.{key}", moments[key], tuple(parameter.shape))
+        self.learning_rates = {
+            name: require_range(f"learning_rates.{name}", state["learning_rates"][name], 0.0, 1.0)
+            for name in self.names
+        }
+        self.iterations = int(state["iterations"])
         if self.guide and state["guide"]:
             self.guide.load_state_dict(state["guide"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import signal
 import time
@@ -18,15 +19,19 @@ from tqdm import tqdm
 
 from cotap.agents.actors import AgentLayout, Observations, as_dict
 from cotap.agents.checkpoint import (
+    MALFORMED,
+    PARTS,
     CheckpointError,
     load_checkpoint,
     remove_leftovers,
     require_layout,
+    require_parts,
     save_checkpoint,
     write_json,
 )
 from cotap.agents.distillation import Guide
 from cotap.agents.dual_ppo import DualPPO, DualPPOConfig
+from cotap.agents.ranks import Ranks
 from cotap.agents.run_log import RunLog
 from cotap.checks import require_positive_int
 
@@ -41,6 +46,8 @@ class RunnerConfig:
     """Iterations in all, those of a resumed run included."""
     save_interval: int = 25
     """Iterations between checkpoints."""
+    save_worlds: bool = True
+    """Save every world's state (14 kB), so that a run goes on exactly; without, worlds start afresh."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
@@ -56,7 +63,7 @@ def layout_of(env: VecEnv, symmetric: bool = True) -> AgentLayout:
 
 
 def check_run_dir(run_dir: Path, resuming: bool) -> None:
-    """Refuse a directory that holds another run, or that cannot be written to.
+    """Refuse a directory that holds another run's checkpoints, or that cannot be written to.
 
     Raises:
         ValueError: the directory is used; the message says what to do.
@@ -64,10 +71,12 @@ def check_run_dir(run_dir: Path, resuming: bool) -> None:
     """
     if run_dir.exists() and not run_dir.is_dir():
         raise ValueError(f"run directory {str(run_dir)!r} is a file")
-    if not resuming and ((run_dir / "config.json").exists() or any(run_dir.glob(CHECKPOINT_PATTERN))):
-        newest = max(run_dir.glob(CHECKPOINT_PATTERN), default=None)
-        way_on = f"go on with --resume {newest}, or choose" if newest else "it has no checkpoint to go on from; choose"
-        raise ValueError(f"run directory {str(run_dir)!r} already holds a run; {way_on} another --run-dir")
+    newest = max(run_dir.glob(CHECKPOINT_PATTERN), default=None)
+    if newest and not resuming:
+        raise ValueError(
+            f"run directory {str(run_dir)!r} already holds a run; "
+            f"go on with --resume {newest}, or choose another --run-dir"
+        )
     run_dir.mkdir(parents=True, exist_ok=True)
     probe = run_dir / ".writable"
     probe.touch()
@@ -90,20 +99,24 @@ class DualRunner(OnPolicyRunner):
         config: The resolved config as plain data, saved beside the run and in every checkpoint.
         device: Where the networks live.
         guide: A frozen policy to stay close to at first.
+        ranks: The processes that learn as one. All call every method alike; rank 0 writes what is written.
     """
 
     def __init__(
         self, env: VecEnv, cfg: RunnerConfig, ppo: DualPPOConfig, run_dir: Path, config: dict[str, Any],
-        device: str = "cpu", guide: Guide | None = None,
+        device: str = "cpu", guide: Guide | None = None, ranks: Ranks | None = None,
     ) -> None:  # fmt: skip
         cfg.check()
         self.env, self.runner_cfg, self.run_dir, self.config, self.device = env, cfg, run_dir, config, device
-        self.alg: DualPPO = DualPPO(layout_of(env, ppo.symmetric), env.num_envs, ppo, device, guide)  # pyright: ignore
+        self.ranks = ranks = ranks or Ranks()
+        layout = layout_of(env, ppo.symmetric)
+        self.alg: DualPPO = DualPPO(layout, env.num_envs, ppo, device, guide, ranks)  # pyright: ignore
         self.current_learning_iteration = 0
         self.wall_seconds = 0.0
         self.failed_saves = 0
         self._saved = -1
         self._save_failed = self._stop = False
+        self._kept: dict[str, Any] = {}
 
     def learn(self, num_learning_iterations: int | None = None, init_at_random_ep_len: bool = False) -> None:
         """Train up to `runner.iterations` in all (or for so many more), saving at intervals and at the end.
@@ -115,39 +128,54 @@ class DualRunner(OnPolicyRunner):
             TrainingFault: an iteration failed; the message says what to go on from.
             OSError: the last save failed, or logs cannot be written from the start.
         """
-        env, alg = self.env, self.alg
+        env, alg, ranks = self.env, self.alg, self.ranks
         self._stop = False
         first = self.current_learning_iteration
         last = self.runner_cfg.iterations if num_learning_iterations is None else first + num_learning_iterations
         if init_at_random_ep_len and first == 0:
             env.episode_length_buf = torch.randint_like(env.episode_length_buf, high=int(env.max_episode_length))
-        remove_leftovers(self.run_dir)
-        write_json(self.run_dir / "config.json", self.config)
-        run_log = RunLog(self.run_dir, env.samples)  # pyright: ignore[reportAttributeAccessIssue]
-        precision = str(alg.dtype).removeprefix("torch.")
-        tqdm.write(f"{env.num_envs} worlds, networks {alg.cfg.hidden} in {precision} on {self.device}, {self.run_dir}")
+        ranks.same_everywhere(alg.model)
+        run_log = None
+        if ranks.leads:
+            remove_leftovers(self.run_dir)
+            write_json(self.run_dir / "config.json", self.config)
+            run_log = RunLog(self.run_dir, env.samples)  # pyright: ignore[reportAttributeAccessIssue]
+            precision = str(alg.dtype).removeprefix("torch.")
+            processes = f"{ranks.size} x " if ranks.size > 1 else ""
+            worlds = f"{processes}{env.num_envs} worlds"
+            tqdm.write(f"{worlds}, networks {alg.cfg.hidden} in {precision} on {self.device}, {self.run_dir}")
         obs = self._observations()
         self._saved = -1
-        with self._signals(), tqdm(total=last, initial=first, unit="it", dynamic_ncols=True) as bar:
+        bar = tqdm(total=last, initial=first, unit="it", dynamic_ncols=True, disable=not ranks.leads)
+        with self._signals(), bar:
             for it in range(first, last):
                 try:
                     obs, scalars = self._iterate(obs)
+                    stopping = ranks.any(self._stop)
                 except Exception as error:
                     raise TrainingFault(self._fault(error)) from error
                 self.current_learning_iteration = it + 1
-                scalars |= {"faults/failed_saves": self.failed_saves, "faults/lost_log_records": run_log.lost}
-                if reason := run_log.write(scalars, env.samples):  # pyright: ignore[reportAttributeAccessIssue]
-                    tqdm.write(f"iteration {it + 1}: its log record could not be written ({reason})")
+                if run_log:
+                    self._log(run_log, scalars)
                 bar.update()
                 bar.set_postfix_str(_summary(scalars))
                 if (it + 1) % self.runner_cfg.save_interval == 0 or self._save_failed:
                     self._save_or_report()
-                if self._stop:
+                if stopping:
                     tqdm.write("stopping: saving a checkpoint")
                     break
+                if ranks.size > 1:
+                    self._kept = copy.deepcopy(self._content(worlds=False))
             if self._saved != self.current_learning_iteration:
                 self.save()
-        run_log.close()
+        if run_log:
+            run_log.close()
+
+    def _log(self, run_log: RunLog, scalars: dict[str, float]) -> None:
+        scalars |= {"faults/failed_saves": self.failed_saves, "faults/lost_log_records": run_log.lost}
+        if reason := run_log.write(scalars, self.env.samples):  # pyright: ignore[reportAttributeAccessIssue]
+            where = f"iteration {self.current_learning_iteration}"
+            tqdm.write(f"{where}: its log record could not be written ({reason})")
 
     def _iterate(self, obs: Observations) -> tuple[Observations, dict[str, float]]:
         """Collect a rollout and learn from it. Returns the observations after it, and what to log."""
@@ -171,12 +199,14 @@ class DualRunner(OnPolicyRunner):
         end = time.perf_counter()
         self.wall_seconds += end - start
         scalars |= {
-            "throughput/steps_per_s": alg.cfg.steps * env.num_envs / (end - start),
+            "throughput/steps_per_s": self.ranks.size * alg.cfg.steps * env.num_envs / (end - start),
             "throughput/collect_s": collected - start,
             "throughput/learn_s": end - collected,
         }
         self._report(getattr(env, "num_diverged", 0) - diverged, learned)
-        return obs, scalars
+        if self.ranks.size > 1:
+            env.keep_in_step(self.ranks.mean)  # pyright: ignore[reportAttributeAccessIssue]
+        return obs, self.ranks.mean_of(scalars)
 
     def _report(self, diverged: int, learned: dict[str, float]) -> None:
         """Name in the log what went wrong in an iteration and was contained."""
@@ -188,6 +218,14 @@ class DualRunner(OnPolicyRunner):
                 tqdm.write(f"{where}: {skipped:.0f} steps of agent {name!r} skipped, their gradient was not finite")
 
     def _fault(self, error: Exception) -> str:
+        """Why an iteration failed and what to go on from. With other ranks, any of which may be the one that is lost,
+        every rank that still runs sees to it that what the last whole iteration learned is saved."""
+        target = self.run_dir / f"checkpoint_{self.current_learning_iteration:06d}.pt"
+        if self._kept and not target.exists():
+            try:
+                save_checkpoint(target, self._kept)
+            except OSError as failed:
+                tqdm.write(f"what was learned last could not be saved: {failed}")
         newest = max(self.run_dir.glob(CHECKPOINT_PATTERN), default=None)
         way_on = f"go on with --resume {newest}" if newest else "there is no checkpoint yet to go on from"
         what = f"{type(error).__name__}: {error}"
@@ -195,20 +233,27 @@ class DualRunner(OnPolicyRunner):
 
     def _save_or_report(self) -> None:
         """Save; if it fails, count it and say so: the run goes on, and every iteration tries again."""
+        failed = False
         try:
             self.save()
         except OSError as error:
+            failed = True
             self.failed_saves += 1
-            self._save_failed = True
             tqdm.write(f"iteration {self.current_learning_iteration}: {error}; trying again after the next iteration")
+        self._save_failed = self.ranks.any(failed)  # the others have nothing to write, and yet must try along
 
     def save(self, path: str | None = None, infos: dict | None = None) -> None:
         """Save everything to go on exactly; the previous checkpoint then sheds its simulator states."""
         if self.alg.guide:
             self.alg.guide.verify()
         target = Path(path) if path else self.run_dir / f"checkpoint_{self.current_learning_iteration:06d}.pt"
-        save_checkpoint(target, self._content() | {"infos": infos or {}})
+        others = self.ranks.gather(self._own_state)
         self._saved, self._save_failed = self.current_learning_iteration, False
+        if not self.ranks.leads:
+            return
+        self._saved = -1
+        save_checkpoint(target, self._content() | {"others": others, "infos": infos or {}})
+        self._saved = self.current_learning_iteration
         older = [path for path in self.run_dir.glob(CHECKPOINT_PATTERN) if path < target]
         if older:
             _shed_simulator_states(max(older))
@@ -220,33 +265,47 @@ class DualRunner(OnPolicyRunner):
             CheckpointError: the file cannot be used, or was trained for another robot or observation layout.
         """
         content = load_checkpoint(path, map_location or self.device)
-        for part in ("layout", "config", "model", "learner", "env", "iteration", "samples", "wall_seconds", "rng"):
-            if part not in content:
-                raise CheckpointError(f"checkpoint {path!r} lacks its part {part!r}")
+        require_parts(path, content, PARTS.keys() - {"agents", "kind"})
         env: Any = self.env
         require_layout(path, content["layout"], json.loads(json.dumps(env.layout())))
         try:
             self.alg.model.load_state_dict(content["model"])
-        except RuntimeError as error:
+        except MALFORMED as error:
             raise CheckpointError(f"checkpoint {path!r} has other networks: {error}") from error
         fresh: list[str] = []
-        if content["learner"]:
-            self.alg.load_state_dict(content["learner"])
-            self.current_learning_iteration = content["iteration"]
-            self.wall_seconds = content["wall_seconds"]
-            torch.set_rng_state(content["rng"].cpu())
-        else:
-            fresh.append("optimisers")
-        if content["env"] and content["env"]["episode_length"].shape[0] == env.num_envs:
-            env.load_state_dict(content["env"])
-        else:
-            env.samples = content["samples"]
-            fresh.append("simulator states")
+        try:
+            if content["learner"]:
+                self.alg.load_state_dict(content["learner"])
+                self.current_learning_iteration = content["iteration"]
+                self.wall_seconds = float(content["wall_seconds"])
+            else:
+                fresh.append("optimisers")
+            mine = self._share_of(content)
+            if content["learner"] and mine["rng"] is not None:
+                torch.set_rng_state(mine["rng"].cpu())
+            if mine["env"] and mine["env"]["episode_length"].shape[0] == env.num_envs:
+                env.load_state_dict(mine["env"])
+            else:
+                env.samples = content["samples"]
+                fresh.append("simulator states")
+        except MALFORMED as error:
+            raise CheckpointError(f"checkpoint {path!r} has states that do not fit this run: {error}") from error
         if fresh:
             tqdm.write(f"{path}: no {' and '.join(fresh)} for this run; starting those afresh")
         return content.get("infos", {})
 
-    def _content(self) -> dict[str, Any]:
+    def _share_of(self, content: dict[str, Any]) -> dict[str, Any]:
+        """This rank's worlds and random numbers in a checkpoint; none, if it is of another number of ranks."""
+        states = [content, *content.get("others", [])]
+        same_number = len(states) == self.ranks.size
+        return states[self.ranks.rank] if same_number else {"env": {}, "rng": None}
+
+    def _own_state(self) -> dict[str, Any]:
+        """What is this rank's own."""
+        env: Any = self.env
+        return {"env": env.state_dict() if self.runner_cfg.save_worlds else {}, "rng": torch.get_rng_state()}
+
+    def _content(self, worlds: bool = True) -> dict[str, Any]:
         env: Any = self.env
         return {
             "kind": self.config.get("stage", "base"),
@@ -255,11 +314,10 @@ class DualRunner(OnPolicyRunner):
             "config": self.config,
             "model": self.alg.model.state_dict(),
             "learner": self.alg.state_dict(),
-            "env": env.state_dict(),
+            **(self._own_state() if worlds else {"env": {}, "rng": torch.get_rng_state()}),
             "iteration": self.current_learning_iteration,
             "samples": env.samples,
             "wall_seconds": self.wall_seconds,
-            "rng": torch.get_rng_state(),
         }
 
     def _observations(self) -> dict[str, torch.Tensor]:
@@ -292,7 +350,7 @@ def _shed_simulator_states(path: Path) -> None:
     try:
         content = load_checkpoint(path)
         if content.get("env"):
-            save_checkpoint(path, content | {"env": {}})
+            save_checkpoint(path, content | {"env": {}, "others": []})
     except CheckpointError:
         return
     except OSError as error:  # a disk that has just become full

@@ -11,7 +11,7 @@ import torch
 from cotap.checks import require_interval, require_one_of, require_range
 from cotap.compliance.laws import LAWS, Arms, ArmState, LawConfig, LawParameters, TorqueLaw
 from cotap.compliance.torso import chain_compliance, hand_base_compliance, torso_compliance
-from cotap.envs.persistence import Stateful, uniform
+from cotap.envs.persistence import Stateful, restored, uniform
 from cotap.envs.state import RobotState
 from cotap.robots import RobotSpec
 from cotap.robots.chains import arm_chains, arm_gains, arm_inertias, chains_between
@@ -192,8 +192,12 @@ class UpperBody(Stateful):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take over what `state_dict` returned. Raises ValueError for another size or a missing name."""
         own = dict(state)
-        self.parameters = LawParameters(**{k: v.clone() for k, v in own.pop("parameters").items()})
+        saved, present = own.pop("parameters"), vars(self.parameters)
+        if saved.keys() != present.keys():
+            raise ValueError(f"UpperBody.parameters expects {sorted(present)}, got {sorted(saved)}")
+        parameters = {k: restored(f"UpperBody.parameters.{k}", saved[k], v) for k, v in present.items()}
         super().load_state_dict(own)
+        self.parameters = LawParameters(**parameters)
 
     def _upper(self, joints: torch.Tensor) -> torch.Tensor:
         return joints[:, len(self._spec.lower_joints) :]
