@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import math
+import os
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -29,9 +30,12 @@ from cotap.motions.joblib_files import load_joblib
 from cotap.motions.library import MotionError, MotionLibrary, shipped_library
 from cotap.robots import RobotSpec
 
+EXAMPLES = int(os.environ.get("COTAP_FUZZ_EXAMPLES", "0"))
+"""How many inputs each property is tried on; 0 for a few that are always the same."""
 # No shrinking: what is drawn is small as it is, and a failure should not take minutes to be told.
 few = settings(
-    max_examples=15,
+    max_examples=EXAMPLES or 15,
+    derandomize=not EXAMPLES,
     deadline=None,
     database=None,
     phases=(Phase.explicit, Phase.generate),

@@ -40,12 +40,20 @@ class Ranks:
         names = {"rank": "RANK", "size": "WORLD_SIZE", "local_rank": "LOCAL_RANK", "local_size": "LOCAL_WORLD_SIZE"}
         default = cls()
         try:
-            values = {field: int(os.environ.get(name, getattr(default, field))) for field, name in names.items()}
+            values = {field: int(os.environ.get(name, str(getattr(default, field)))) for field, name in names.items()}
         except ValueError as error:
             raise ValueError(f"{', '.join(names.values())} in the environment must be integers: {error}") from error
         ranks = cls(**values)
         if not (0 <= ranks.rank < ranks.size and 0 <= ranks.local_rank < ranks.local_size):
             raise ValueError(f"the environment's {', '.join(names.values())} do not fit together: {ranks}")
+        if os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True" and os.environ.get(
+            "TORCHELASTIC_MAX_RESTARTS", "0"
+        ) not in ("", "0"):
+            # https://github.com/pytorch/pytorch/issues/135712: restarted ranks look for each other where the lost were.
+            raise ValueError(
+                "with --max-restarts, torchrun needs TORCH_DISABLE_SHARE_RDZV_TCP_STORE=1 in its environment: "
+                "otherwise processes that it restarts do not find each other"
+            )
         return ranks
 
     @property

@@ -89,7 +89,8 @@ class TrainingFault(RuntimeError):
 
 class DualRunner(OnPolicyRunner):
     """rsl_rl's runner for two agents. Replaces its loop, its saving (all that a run depends on) and its loading
-    (no code is run from a file); needs an environment with `action_slices`, `obs_groups` and `state_dict`.
+    (no code is run from a file); needs an environment with `action_slices`, `obs_groups` and `state_dict`, and among
+    several ranks with `keep_in_step`.
 
     Args:
         env: The environment.
@@ -152,20 +153,20 @@ class DualRunner(OnPolicyRunner):
                 try:
                     obs, scalars = self._iterate(obs)
                     stopping = ranks.any(self._stop)
+                    self.current_learning_iteration = it + 1
+                    if ranks.size > 1:
+                        self._kept = copy.deepcopy(self._content(worlds=False))
+                    if run_log:
+                        self._log(run_log, scalars)
+                    if (it + 1) % self.runner_cfg.save_interval == 0 or self._save_failed:
+                        self._save_or_report()
                 except Exception as error:
-                    raise TrainingFault(self._fault(error)) from error
-                self.current_learning_iteration = it + 1
-                if run_log:
-                    self._log(run_log, scalars)
+                    raise TrainingFault(self._fault(it + 1, error)) from error
                 bar.update()
                 bar.set_postfix_str(_summary(scalars))
-                if (it + 1) % self.runner_cfg.save_interval == 0 or self._save_failed:
-                    self._save_or_report()
                 if stopping:
                     tqdm.write("stopping: saving a checkpoint")
                     break
-                if ranks.size > 1:
-                    self._kept = copy.deepcopy(self._content(worlds=False))
             if self._saved != self.current_learning_iteration:
                 self.save()
         if run_log:
@@ -217,19 +218,20 @@ class DualRunner(OnPolicyRunner):
             if skipped := learned[f"{name}/skipped"]:
                 tqdm.write(f"{where}: {skipped:.0f} steps of agent {name!r} skipped, their gradient was not finite")
 
-    def _fault(self, error: Exception) -> str:
+    def _fault(self, iteration: int, error: Exception) -> str:
         """Why an iteration failed and what to go on from. With other ranks, any of which may be the one that is lost,
         every rank that still runs sees to it that what the last whole iteration learned is saved."""
-        target = self.run_dir / f"checkpoint_{self.current_learning_iteration:06d}.pt"
-        if self._kept and not target.exists():
+        if self._kept:
+            target = self.run_dir / f"checkpoint_{self._kept['iteration']:06d}.pt"
             try:
-                save_checkpoint(target, self._kept)
+                if not target.exists():
+                    save_checkpoint(target, self._kept)
             except OSError as failed:
                 tqdm.write(f"what was learned last could not be saved: {failed}")
         newest = max(self.run_dir.glob(CHECKPOINT_PATTERN), default=None)
         way_on = f"go on with --resume {newest}" if newest else "there is no checkpoint yet to go on from"
         what = f"{type(error).__name__}: {error}"
-        return f"iteration {self.current_learning_iteration + 1} failed ({what}); {way_on}"
+        return f"iteration {iteration} failed ({what}); {way_on}"
 
     def _save_or_report(self) -> None:
         """Save; if it fails, count it and say so: the run goes on, and every iteration tries again."""
@@ -240,7 +242,9 @@ class DualRunner(OnPolicyRunner):
             failed = True
             self.failed_saves += 1
             tqdm.write(f"iteration {self.current_learning_iteration}: {error}; trying again after the next iteration")
-        self._save_failed = self.ranks.any(failed)  # the others have nothing to write, and yet must try along
+        self._save_failed = self.ranks.any(failed)
+        if self._save_failed:
+            self._saved = -1  # on every rank: those that have nothing to write must try along
 
     def save(self, path: str | None = None, infos: dict | None = None) -> None:
         """Save everything to go on exactly; the previous checkpoint then sheds its simulator states."""
@@ -248,15 +252,12 @@ class DualRunner(OnPolicyRunner):
             self.alg.guide.verify()
         target = Path(path) if path else self.run_dir / f"checkpoint_{self.current_learning_iteration:06d}.pt"
         others = self.ranks.gather(self._own_state)
-        self._saved, self._save_failed = self.current_learning_iteration, False
-        if not self.ranks.leads:
-            return
-        self._saved = -1
-        save_checkpoint(target, self._content() | {"others": others, "infos": infos or {}})
+        if self.ranks.leads:
+            save_checkpoint(target, self._content() | {"others": others, "infos": infos or {}})
+            older = [path for path in self.run_dir.glob(CHECKPOINT_PATTERN) if path < target]
+            if older:
+                _shed_simulator_states(max(older))
         self._saved = self.current_learning_iteration
-        older = [path for path in self.run_dir.glob(CHECKPOINT_PATTERN) if path < target]
-        if older:
-            _shed_simulator_states(max(older))
 
     def load(self, path: str, *_: Any, map_location: str | None = None, **__: Any) -> dict:
         """Load a checkpoint. What it lacks (a shipped one has no optimiser or simulator states) starts afresh.
