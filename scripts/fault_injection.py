@@ -59,14 +59,14 @@ class Row:
 class Run:
     """A training in a process of its own, watched from outside."""
 
-    def __init__(self, folder: Path, prepare: Prepare | None = None) -> None:
+    def __init__(self, folder: Path, prepare: Prepare | None = None, log: Path | None = None) -> None:
         self.folder = folder
         self.start = newest_iteration(folder)
         resume = ["--resume", newest(folder)] if self.start else ["--run-dir", folder]
         if not self.start:
             shutil.rmtree(folder, ignore_errors=True)  # killed before its first checkpoint: begins again
         read, write = os.pipe()
-        self.log = Path(f"{folder}.log")
+        self.log = log or Path(f"{folder}.log")
         self._status: int | None = None
         self.born = time.monotonic()
         self.pid = os.fork()
@@ -116,8 +116,9 @@ def _train(args: list[str], log: Path, beats: int, prepare: Prepare | None) -> N
     except Exception:
         traceback.print_exc()
     finally:
-        sys.stdout.flush()
-        sys.stderr.flush()
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(OSError):
+                stream.flush()
         os._exit(status)
 
 
@@ -384,26 +385,32 @@ def full_disk(work: Path, reference: Path) -> list[Row]:
         ballast.unlink()
 
     folder = disk / "while"
-    run = Run(folder, _both(at_step(3 * STEPS, fill), at_step(9 * STEPS, free)))
-    text_ok = run.wait() == 0 and "trying again after the next iteration" in Path(run.log).read_text()
+    run = Run(folder, _both(at_step(3 * STEPS, fill), at_step(9 * STEPS, free)))  # its output goes to the full disk too
+    done = run.wait() == 0
     failed = int(curve(folder, "faults/failed_saves")[-1][1])
-    ok = text_ok and failed > 0 and same_end(folder, reference)
+    ok = done and failed > 0 and same_end(folder, reference)
     rows = [Row("disk full for six iterations", 1, int(ok), 0, f"{failed} saves failed; ends bit for bit equal")]
 
     folder = disk / "for-good"
     shutil.rmtree(disk / "while")
-    run = Run(folder, at_step(3 * STEPS, fill))
+    run = Run(folder, at_step(3 * STEPS, fill), work / "for-good.log")
     status = run.wait()
     done = run.finished_iterations()
     kept = newest_iteration(folder)
     ballast.unlink()
-    ok = status == 2 and kept == INTERVAL and Run(folder).wait() == 0 and same_end(folder, reference)
+    ok = (
+        "trying again after the next iteration" in run.log.read_text()
+        and status == 2
+        and kept == INTERVAL
+        and Run(folder).wait() == 0
+        and same_end(folder, reference)
+    )
     outcome = "trains on, tries to save after every iteration, ends with an error; last checkpoint whole"
     rows.append(Row("disk full for good", 1, int(ok), done - kept, outcome))
 
     shutil.rmtree(folder)
     _mount("-o", "remount,ro", disk)
-    run = Run(disk / "never")
+    run = Run(disk / "never", log=work / "never.log")
     ok = run.wait() == 2 and "Read-only file system" in run.log.read_text() and not (disk / "never").exists()
     rows.append(Row("read-only file system", 1, int(ok), 0, "refused before anything is done"))
     return rows

@@ -205,6 +205,7 @@ def _train(stage: str, options: BaseOptions | DistillOptions, base: dict[str, An
     import torch
 
     from cotap.agents.ranks import Ranks
+    from cotap.agents.run_log import say
     from cotap.agents.runner import DualRunner, check_run_dir
     from cotap.envs import H1Env
 
@@ -236,7 +237,7 @@ def _train(stage: str, options: BaseOptions | DistillOptions, base: dict[str, An
             check_run_dir(run_dir, resuming=resumed_dir is not None and run_dir.resolve() == resumed_dir.resolve())
         runner.learn(init_at_random_ep_len=True)
     if ranks.leads:
-        print(f"{runner.current_learning_iteration} iterations, {runner.wall_seconds:.0f} s: {run_dir}")
+        say(f"{runner.current_learning_iteration} iterations, {runner.wall_seconds:.0f} s: {run_dir}")
     return run_dir
 
 

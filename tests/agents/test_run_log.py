@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import sys
 import time
 from pathlib import Path
 
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tqdm import tqdm
 
-from cotap.agents.run_log import RunLog
+from cotap.agents.run_log import RunLog, Unfailing, say
 
 
 def curve(folder: Path) -> list[tuple[int, float]]:
@@ -66,3 +70,31 @@ def test_a_record_that_does_not_fit_is_left_out_whole_and_counted(tmp_path: Path
 def test_a_folder_that_is_none_is_an_os_error(tmp_path: Path):
     with pytest.raises(OSError, match="No such file"):
         RunLog(tmp_path / "missing", 0)
+
+
+class FullStream:
+    """Output that is redirected to a full disk."""
+
+    encoding = "utf-8"
+
+    def write(self, _text: str) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def flush(self) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_a_full_disk_under_the_output_ends_nothing(monkeypatch: pytest.MonkeyPatch):
+    full = FullStream()
+    with pytest.raises(OSError, match="No space left"):
+        tqdm.write("lost", file=full)
+    monkeypatch.setattr(sys, "stdout", full)
+    say("lost")
+    monkeypatch.undo()
+    bar = tqdm(total=3, file=Unfailing(full), mininterval=0.0)
+    assert [bar.update() for _ in range(3)] == [True] * 3
+
+
+def test_what_is_said_goes_to_the_present_output(capsys: pytest.CaptureFixture[str]):
+    say("heard")
+    assert capsys.readouterr().out == "heard\n"

@@ -1,17 +1,21 @@
-"""A run's curves as TensorBoard reads them: whole to the last iteration, whatever ends the run."""
+"""A run's curves as TensorBoard reads them, and what it says: whole to the last iteration, and no reason to end it."""
 
 from __future__ import annotations
 
 # TensorBoard's protocol buffers have no type stubs.
 # pyright: reportAttributeAccessIssue=false, reportCallIssue=false
+import contextlib
 import io
 import os
+import sys
 import time
 from pathlib import Path
 
 from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.summary.writer.record_writer import RecordWriter
+from tqdm import tqdm
+from tqdm.utils import ObjectWrapper
 
 _PREFIX = "events.out.tfevents."
 
@@ -69,6 +73,31 @@ class RunLog:
             self._file.truncate(self._size)  # a reader would go no further than a torn record
             raise
         self._size = self._file.tell()
+
+
+class Unfailing(ObjectWrapper):
+    """A stream whose failures end nothing: a run that is logged to a full disk goes on unseen."""
+
+    def write(self, text: str) -> int:
+        """Write what can be written."""
+        with contextlib.suppress(OSError):
+            self._wrapped.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        """Flush if that can be done."""
+        with contextlib.suppress(OSError):
+            self._wrapped.flush()
+
+    def __eq__(self, other: object) -> bool:  # tqdm asks whether a message goes where its bar is
+        return self._wrapped == getattr(other, "_wrapped", other)
+
+    __hash__ = None  # pyright: ignore[reportAssignmentType]
+
+
+def say(text: str) -> None:
+    """Print a line above the progress bar."""
+    tqdm.write(text, file=Unfailing(sys.stdout))
 
 
 def _stamp(path: Path) -> int:

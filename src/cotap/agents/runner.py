@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -32,7 +33,7 @@ from cotap.agents.checkpoint import (
 from cotap.agents.distillation import Guide
 from cotap.agents.dual_ppo import DualPPO, DualPPOConfig
 from cotap.agents.ranks import Ranks
-from cotap.agents.run_log import RunLog
+from cotap.agents.run_log import RunLog, Unfailing, say
 from cotap.checks import require_positive_int
 
 CHECKPOINT_PATTERN = "checkpoint_*.pt"
@@ -144,10 +145,13 @@ class DualRunner(OnPolicyRunner):
             precision = str(alg.dtype).removeprefix("torch.")
             processes = f"{ranks.size} x " if ranks.size > 1 else ""
             worlds = f"{processes}{env.num_envs} worlds"
-            tqdm.write(f"{worlds}, networks {alg.cfg.hidden} in {precision} on {self.device}, {self.run_dir}")
+            say(f"{worlds}, networks {alg.cfg.hidden} in {precision} on {self.device}, {self.run_dir}")
         obs = self._observations()
         self._saved = -1
-        bar = tqdm(total=last, initial=first, unit="it", dynamic_ncols=True, disable=not ranks.leads)
+        bar = tqdm(
+            total=last, initial=first, unit="it", dynamic_ncols=True, disable=not ranks.leads,
+            file=Unfailing(sys.stderr),
+        )  # fmt: skip
         with self._signals(), bar:
             for it in range(first, last):
                 try:
@@ -165,7 +169,7 @@ class DualRunner(OnPolicyRunner):
                 bar.update()
                 bar.set_postfix_str(_summary(scalars))
                 if stopping:
-                    tqdm.write("stopping: saving a checkpoint")
+                    say("stopping: saving a checkpoint")
                     break
             if self._saved != self.current_learning_iteration:
                 self.save()
@@ -176,7 +180,7 @@ class DualRunner(OnPolicyRunner):
         scalars |= {"faults/failed_saves": self.failed_saves, "faults/lost_log_records": run_log.lost}
         if reason := run_log.write(scalars, self.env.samples):  # pyright: ignore[reportAttributeAccessIssue]
             where = f"iteration {self.current_learning_iteration}"
-            tqdm.write(f"{where}: its log record could not be written ({reason})")
+            say(f"{where}: its log record could not be written ({reason})")
 
     def _iterate(self, obs: Observations) -> tuple[Observations, dict[str, float]]:
         """Collect a rollout and learn from it. Returns the observations after it, and what to log."""
@@ -213,10 +217,10 @@ class DualRunner(OnPolicyRunner):
         """Name in the log what went wrong in an iteration and was contained."""
         where = f"iteration {self.current_learning_iteration + 1}"
         if diverged:
-            tqdm.write(f"{where}: worlds diverged {diverged} times; each was ended, counted and started again")
+            say(f"{where}: worlds diverged {diverged} times; each was ended, counted and started again")
         for name in self.alg.names:
             if skipped := learned[f"{name}/skipped"]:
-                tqdm.write(f"{where}: {skipped:.0f} steps of agent {name!r} skipped, their gradient was not finite")
+                say(f"{where}: {skipped:.0f} steps of agent {name!r} skipped, their gradient was not finite")
 
     def _fault(self, iteration: int, error: Exception) -> str:
         """Why an iteration failed and what to go on from. With other ranks, any of which may be the one that is lost,
@@ -227,7 +231,7 @@ class DualRunner(OnPolicyRunner):
                 if not target.exists():
                     save_checkpoint(target, self._kept)
             except OSError as failed:
-                tqdm.write(f"what was learned last could not be saved: {failed}")
+                say(f"what was learned last could not be saved: {failed}")
         newest = max(self.run_dir.glob(CHECKPOINT_PATTERN), default=None)
         way_on = f"go on with --resume {newest}" if newest else "there is no checkpoint yet to go on from"
         what = f"{type(error).__name__}: {error}"
@@ -241,7 +245,7 @@ class DualRunner(OnPolicyRunner):
         except OSError as error:
             failed = True
             self.failed_saves += 1
-            tqdm.write(f"iteration {self.current_learning_iteration}: {error}; trying again after the next iteration")
+            say(f"iteration {self.current_learning_iteration}: {error}; trying again after the next iteration")
         self._save_failed = self.ranks.any(failed)
         if self._save_failed:
             self._saved = -1  # on every rank: those that have nothing to write must try along
@@ -292,7 +296,7 @@ class DualRunner(OnPolicyRunner):
         except MALFORMED as error:
             raise CheckpointError(f"checkpoint {path!r} has states that do not fit this run: {error}") from error
         if fresh:
-            tqdm.write(f"{path}: no {' and '.join(fresh)} for this run; starting those afresh")
+            say(f"{path}: no {' and '.join(fresh)} for this run; starting those afresh")
         return content.get("infos", {})
 
     def _share_of(self, content: dict[str, Any]) -> dict[str, Any]:
@@ -355,7 +359,7 @@ def _shed_simulator_states(path: Path) -> None:
     except CheckpointError:
         return
     except OSError as error:  # a disk that has just become full
-        tqdm.write(f"{path} keeps its simulator states: {error}")
+        say(f"{path} keeps its simulator states: {error}")
 
 
 def _summary(s: dict[str, float]) -> str:
