@@ -152,7 +152,7 @@ def damaged(checkpoint: Path, kind: str) -> tuple[Path, list[str]]:
     if kind == "missing":
         return path, ["does not exist"]
     if kind == "folder":
-        return checkpoint.parent, ["does not exist"]
+        return checkpoint.parent, ["is no file"]
     if kind == "truncated":
         path.write_bytes(checkpoint.read_bytes()[:-1000])
         return path, ["truncated"]
@@ -289,6 +289,26 @@ def test_a_resumed_run_ends_where_a_straight_one_does(checkpoint: Path, tmp_path
     for key, value in straight["model"].items():
         assert torch.equal(value, resumed["model"][key]), key
     assert torch.equal(straight["env"]["sim"]["state"], resumed["env"]["sim"]["state"])
+
+
+def test_resume_auto_begins_where_there_is_nothing_and_goes_on_where_there_is(tmp_path: Path):
+    folder = tmp_path / "run"
+    first = run_small(folder, GAMMA, 0.9, RESUME, "auto")
+    assert first["iteration"] == 2
+    (folder / "config.json").unlink()
+    assert run("base", f"{RESUME}=auto", RUN_DIR, folder, ITERATIONS, 3) == 0
+    second = newest(folder)
+    assert (second["iteration"], second["config"]["training"]["ppo"]["gamma"]) == (3, 0.9)
+
+
+def test_resume_auto_begins_again_in_the_folder_of_a_run_without_checkpoints(tmp_path: Path):
+    (tmp_path / "config.json").write_text("{}")
+    assert run_small(tmp_path, RESUME, "auto")["iteration"] == 2
+
+
+def test_resume_auto_needs_to_know_where(capsys: pytest.CaptureFixture[str]):
+    assert run("base", *SMALL, RESUME, "auto") == 2
+    assert "--run-dir" in capsys.readouterr().err
 
 
 def test_a_run_repeats_for_its_seed_and_for_no_other(base: Path, tmp_path: Path):

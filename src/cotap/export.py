@@ -18,7 +18,7 @@ class ExportOptions:
     output: str
     """Where the ONNX file goes."""
     checkpoint: str = ""
-    """Checkpoint to export; by default the shipped base policy."""
+    """Checkpoint to export; by default the shipped CoTaP policy."""
     checks: int = 1000
     """Observations over which the file is compared with torch before it is kept."""
     seed: int = 0

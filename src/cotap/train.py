@@ -7,6 +7,7 @@ import platform
 import subprocess
 import sys
 import time
+import traceback
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -39,7 +40,7 @@ class BaseOptions:
     run_dir: str = ""
     """Where the run goes; by default runs/base-DATE-TIME, or the resumed checkpoint's folder."""
     resume: str = ""
-    """Checkpoint to go on from; its config is the default for every option."""
+    """Checkpoint to go on from; its config is the default for every option. auto: the newest in --run-dir, if any."""
     recipe: str = "default"
     """default (from nothing to walking); paper (the same with the paper's networks); robust (blows and loads on the
     hands: with --resume, what a policy that walks learns next, from nothing without it); for ablations,
@@ -58,7 +59,8 @@ class DistillOptions:
     run_dir: str = ""
     """Where the run goes; by default runs/distill-DATE-TIME, or the resumed checkpoint's folder."""
     resume: str = ""
-    """Checkpoint of a distillation to go on from; its config is the default for every option."""
+    """Checkpoint of a distillation to go on from; its config is the default for every option. auto: the newest in
+    --run-dir, if any."""
     base_checkpoint: str = ""
     """Base policy to begin from and to be guided by; by default the shipped one."""
     recipe: str = "default"
@@ -96,7 +98,7 @@ class PipelineOptions:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Parse, train, report. Returns the exit status: 0, or 2 for bad input."""
+    """Parse, train, report. Returns the exit status: 0, 2 for bad input, 1 for a training that failed."""
     args = list(sys.argv[1:] if argv is None else argv)
     stage = args.pop(0) if args and not args[0].startswith("-") else ""
     try:
@@ -113,6 +115,10 @@ def main(argv: list[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except RuntimeError as error:  # an iteration failed, or the frozen base was found changed
+        traceback.print_exception(error.__cause__ or error)
+        print(f"error: {error}", file=sys.stderr)
+        return 1
     except KeyboardInterrupt:  # asked to stop twice
         print("interrupted before the checkpoint was saved; the last one is whole", file=sys.stderr)
         return 130
@@ -120,7 +126,24 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _expand(args: list[str]) -> list[str]:
-    return [SHORTCUTS.get(key, key) + sep + value for key, sep, value in (a.partition("=") for a in args)]
+    from cotap.agents.runner import CHECKPOINT_PATTERN
+
+    args = [SHORTCUTS.get(key, key) + sep + value for key, sep, value in (a.partition("=") for a in args)]
+    if _peek(args, "--resume") != "auto":
+        return args
+    run_dir = _peek(args, "--run-dir")
+    if not run_dir:
+        raise ValueError("--resume auto looks for checkpoints in --run-dir, which is not given")
+    newest = max(Path(run_dir).glob(CHECKPOINT_PATTERN), default="")
+    return ["--resume=" + str(newest) if a == "--resume=auto" else a for a in _joined(args, "--resume")]
+
+
+def _joined(args: list[str], option: str) -> list[str]:
+    """`option` and its value as one argument."""
+    if option not in args:
+        return args
+    i = args.index(option)
+    return [*args[:i], f"{option}={args[i + 1]}", *args[i + 2 :]]
 
 
 def _parse_base(args: list[str]) -> BaseOptions:
@@ -156,12 +179,12 @@ def _parse_distill(args: list[str]) -> DistillOptions:
 
 
 def _config_of(checkpoint: str, kind: type[Any]) -> Any:
-    from cotap.agents.checkpoint import CheckpointError, load_checkpoint
+    from cotap.agents.checkpoint import MALFORMED, CheckpointError, load_checkpoint
 
     content = load_checkpoint(checkpoint)
     try:
         return from_plain(kind, content["config"]["training"])
-    except (KeyError, TypeError, ValueError) as error:
+    except MALFORMED as error:
         raise CheckpointError(f"checkpoint {checkpoint!r} has no usable config: {error}") from error
 
 
@@ -185,15 +208,14 @@ def train_distill(options: DistillOptions) -> Path:
     Raises:
         CheckpointError: the base checkpoint cannot be used, is not of stage 1, or has other networks.
     """
-    from cotap.agents.checkpoint import CheckpointError, load_checkpoint
+    from cotap.agents.checkpoint import CheckpointError, load_checkpoint, require_parts
 
     base = None
     if not options.resume:
         base = load_checkpoint(options.base_checkpoint)
-        if base.get("kind") != "base":
-            raise CheckpointError(
-                f"checkpoint {options.base_checkpoint!r} is of stage {base.get('kind')!r}, not 'base'"
-            )
+        require_parts(options.base_checkpoint, base, ("kind", "layout", "model"))
+        if base["kind"] != "base":
+            raise CheckpointError(f"checkpoint {options.base_checkpoint!r} is of stage {base['kind']!r}, not 'base'")
     return _train("distill", options, base)
 
 
@@ -201,29 +223,40 @@ def _train(stage: str, options: BaseOptions | DistillOptions, base: dict[str, An
     """What both stages share. `base` is the checkpoint that a distillation begins from."""
     import torch
 
+    from cotap.agents.ranks import Ranks
+    from cotap.agents.run_log import say
     from cotap.agents.runner import DualRunner, check_run_dir
     from cotap.envs import H1Env
 
-    training = options.training
+    training, ranks = options.training, Ranks.from_environment()
     resumed_dir = Path(options.resume).parent if options.resume else None
+    if ranks.size > 1 and not (options.run_dir or resumed_dir):
+        raise ValueError("several processes need one --run-dir, got none")
     run_dir = Path(options.run_dir) if options.run_dir else resumed_dir or _new_run_dir(stage)
     training.env.seed, training.env.num_threads = training.seed, training.threads
     training.check()
-    if training.threads:
-        torch.set_num_threads(training.threads)
-    torch.manual_seed(training.seed)
     config = {"stage": stage, "training": to_plain(training), **_provenance(options.command)}
-    env = H1Env(training.env)
-    guide = _guide(env, options, base) if isinstance(options, DistillOptions) else None
-    runner = DualRunner(env, training.runner, training.ppo, run_dir, config, training.device, guide)
-    if guide and not options.resume:
-        guide.start(runner.alg.model)
-    if options.resume:
-        runner.load(options.resume)
-    # Last, so that nothing is left behind when any of the above refuses.
-    check_run_dir(run_dir, resuming=resumed_dir is not None and run_dir.resolve() == resumed_dir.resolve())
-    runner.learn(init_at_random_ep_len=True)
-    print(f"{runner.current_learning_iteration} iterations, {runner.wall_seconds:.0f} s: {run_dir}")
+    training.env.seed, training.env.num_threads = ranks.seed(training.seed), ranks.threads(training.threads)
+    training.device = ranks.device(training.device)
+    if training.env.num_threads:
+        torch.set_num_threads(training.env.num_threads)
+    torch.manual_seed(training.seed)  # networks begin alike everywhere
+    with ranks.joined(training.device):
+        env = H1Env(training.env, ranks.size)
+        guide = _guide(env, options, base) if isinstance(options, DistillOptions) else None
+        runner = DualRunner(env, training.runner, training.ppo, run_dir, config, training.device, guide, ranks)
+        if guide and not options.resume:
+            guide.start(runner.alg.model)
+        if ranks.size > 1:
+            torch.manual_seed(training.env.seed)
+        if options.resume:
+            runner.load(options.resume)
+        # Last, so that nothing is left behind when any of the above refuses.
+        if ranks.leads:
+            check_run_dir(run_dir, resuming=resumed_dir is not None and run_dir.resolve() == resumed_dir.resolve())
+        runner.learn(init_at_random_ep_len=True)
+    if ranks.leads:
+        say(f"{runner.current_learning_iteration} iterations, {runner.wall_seconds:.0f} s: {run_dir}")
     return run_dir
 
 
@@ -232,7 +265,7 @@ def _guide(env: Any, options: DistillOptions, base: dict[str, Any] | None) -> An
     import json
 
     from cotap.agents.actors import DualActorCritic
-    from cotap.agents.checkpoint import CheckpointError, require_layout
+    from cotap.agents.checkpoint import MALFORMED, CheckpointError, require_layout
     from cotap.agents.distillation import Guide
     from cotap.agents.runner import layout_of
 
@@ -242,14 +275,22 @@ def _guide(env: Any, options: DistillOptions, base: dict[str, Any] | None) -> An
         require_layout(options.base_checkpoint, base["layout"], json.loads(json.dumps(env.layout())))
         try:
             model.load_state_dict(base["model"])
-        except RuntimeError as error:
+        except MALFORMED as error:
             raise CheckpointError(f"checkpoint {options.base_checkpoint!r} has other networks: {error}") from error
     return Guide(model.to(training.device), training.distillation)
 
 
 def train_both(options: PipelineOptions) -> Path:
-    """Run stage 1, then stage 2 from its result, and sum both up. Returns the directory of both."""
+    """Run stage 1, then stage 2 from its result, and sum both up. Returns the directory of both.
+
+    Raises:
+        ValueError: an option is out of its range, or this is one of several processes.
+    """
+    from cotap.agents.ranks import Ranks
+
     options.check()
+    if Ranks.from_environment().size > 1:
+        raise ValueError("several processes train stage by stage: python -m cotap.train base, then distill")
     run_dir = Path(options.run_dir) if options.run_dir else _new_run_dir("cotap")
     common = ["--num-envs", str(options.num_envs), "--seed", str(options.seed), "--threads", str(options.threads)]
     walking = _train_base_with(

@@ -69,10 +69,39 @@ def test_files_are_readable_by_whom_the_umask_allows(tmp_path: Path, mask: int):
         assert stat.S_IMODE(path.stat().st_mode) == 0o666 & ~mask, path.name
 
 
+def test_a_file_that_the_system_does_not_read_is_called_that(good: Path, monkeypatch: pytest.MonkeyPatch):
+    def fail(_path: Path) -> bytes:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr(Path, "read_bytes", fail)
+    with pytest.raises(CheckpointError, match=r"cannot be opened or read from disk: .*Input/output error") as error:
+        load_checkpoint(good)
+    assert "truncated" not in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["a\0b.pt", "a" * 300])
+def test_a_name_that_no_file_can_have_is_refused(tmp_path: Path, name: str):
+    with pytest.raises(CheckpointError, match="checkpoint"):
+        load_checkpoint(tmp_path / name)
+
+
+def test_an_archive_that_unpacks_to_more_than_itself_is_refused(good: Path):
+    """A few kilobytes that would become gigabytes."""
+    with zipfile.ZipFile(good) as archive:
+        entries = {name: archive.read(name) for name in archive.namelist()}
+    largest = max(entries, key=lambda name: len(entries[name]))
+    entries[largest] = bytes(50_000_000)
+    with zipfile.ZipFile(good, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in entries.items():
+            archive.writestr(name, data)
+    with pytest.raises(CheckpointError, match="unpacks to more"):
+        load_checkpoint(good)
+
+
 @pytest.mark.parametrize("name", ["missing.pt", "missing/checkpoint.pt", "."])
 def test_missing_file_is_named(tmp_path: Path, name: str):
     path = tmp_path / name
-    with pytest.raises(CheckpointError, match=r"does not exist|is a directory") as error:
+    with pytest.raises(CheckpointError, match=r"does not exist|is no file") as error:
         load_checkpoint(path)
     assert str(path) in str(error.value)
 

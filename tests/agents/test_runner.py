@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from dummy_env import DummyEnv, make_runner
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from cotap.agents.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
-from cotap.agents.runner import DualRunner, RunnerConfig, check_run_dir
+from cotap.agents.runner import DualRunner, RunnerConfig, TrainingFault, check_run_dir
 from cotap.envs import H1Env, H1EnvConfig
 from cotap.envs.observations import NoiseConfig, ObservationConfig
 from cotap.envs.terminations import TerminationConfig
@@ -309,22 +310,137 @@ def test_an_unreadable_older_checkpoint_does_not_end_a_run(tmp_path: Path, conte
     assert tmp_path.joinpath("checkpoint_000000.pt").read_bytes() == content
 
 
-def test_a_full_disk_ends_the_run_and_keeps_what_was_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    runner = make_runner(tmp_path, 6, save_interval=2)
-    real, calls = torch.save, []
+def fail_saves(monkeypatch: pytest.MonkeyPatch, iterations: Collection[int]) -> None:
+    """Saves of these iterations fail as on a full disk."""
+    real = torch.save
 
     def save(content: Any, path: Any) -> None:
-        calls.append(content["iteration"])
-        if content["iteration"] > 2:
+        if content["iteration"] in iterations and content["env"]:
             Path(path).write_bytes(b"part")
             raise RuntimeError("PytorchStreamWriter failed writing file")
         real(content, path)
 
     monkeypatch.setattr(torch, "save", save)
-    with pytest.raises(OSError, match=r"checkpoint_000004.*failed writing"):
-        runner.learn()
+
+
+def test_a_full_disk_is_reported_and_saving_tried_again_until_it_works(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    fail_saves(monkeypatch, (4, 5))
+    runner = make_runner(tmp_path, 7, save_interval=2)
+    runner.learn(init_at_random_ep_len=True)
+    assert names(tmp_path) == [*(f"checkpoint_{i:06d}.pt" for i in (2, 6, 7)), "config.json"]
+    assert runner.failed_saves == 2
+    said = "".join(capsys.readouterr())
+    for iteration in (4, 5):
+        assert f"iteration {iteration}: cannot write checkpoint" in said
+    monkeypatch.undo()
+    make_runner(tmp_path / "straight", 7).learn(init_at_random_ep_len=True)
+    assert_same_run(checkpoint(tmp_path, 7), checkpoint(tmp_path / "straight", 7))
+    logs = EventAccumulator(str(tmp_path))
+    logs.Reload()
+    assert [e.value for e in logs.Scalars("faults/failed_saves")] == [0, 0, 0, 0, 1, 2, 2]
+
+
+def test_a_disk_that_stays_full_ends_the_run_and_keeps_what_was_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    fail_saves(monkeypatch, range(3, 9))
+    with pytest.raises(OSError, match=r"checkpoint_000006.*failed writing"):
+        make_runner(tmp_path, 6, save_interval=2).learn()
     assert names(tmp_path) == ["checkpoint_000002.pt", "config.json"]
     assert load_checkpoint(checkpoint(tmp_path, 2))["env"] != {}
+
+
+def test_an_older_checkpoint_that_cannot_be_replaced_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    real = torch.save
+
+    def save(content: Any, path: Any) -> None:
+        if not content["env"]:
+            raise RuntimeError("full")
+        real(content, path)
+
+    monkeypatch.setattr(torch, "save", save)
+    runner = make_runner(tmp_path, 4, save_interval=2)
+    runner.learn()
+    assert "checkpoint_000002.pt keeps its simulator states" in "".join(capsys.readouterr())
+    assert runner.failed_saves == 0
+    assert load_checkpoint(checkpoint(tmp_path, 2))["env"] != {}
+    assert load_checkpoint(checkpoint(tmp_path, 4))["env"] != {}
+
+
+def test_a_step_that_raises_ends_the_run_with_what_to_do(tmp_path: Path):
+    runner = make_runner(tmp_path, 9, save_interval=2)
+
+    def fail(step: int) -> None:
+        if step == 5 * STEPS + 1:
+            raise KeyError("a worker")
+
+    runner.env.on_step = fail
+    with pytest.raises(TrainingFault, match=r"iteration 6 failed \(KeyError: 'a worker'\)") as error:
+        runner.learn()
+    assert f"go on with --resume {checkpoint(tmp_path, 4)}" in str(error.value)
+    assert isinstance(error.value.__cause__, KeyError)
+    assert load_checkpoint(checkpoint(tmp_path, 4))["env"] != {}
+
+
+def test_a_reward_that_is_no_number_teaches_its_agent_nothing_and_is_counted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    runner = make_runner(tmp_path, 1)
+    before = weights(runner)
+    step = runner.env.step
+
+    def spoiled(actions: torch.Tensor) -> Any:
+        result = step(actions)
+        result[3]["group_rewards"][2, 0] = math.nan
+        return result
+
+    runner.env.step = spoiled
+    runner.learn()
+    steps = dummy_env.TINY["epochs"] * dummy_env.TINY["mini_batches"]
+    assert f"iteration 1: {steps} steps of agent 'lower' skipped" in "".join(capsys.readouterr())
+    changed = {k for k, v in weights(runner).items() if not torch.equal(v, before[k])}
+    assert not any("lower" in k for k in changed)
+    assert any("critics.upper" in k for k in changed)
+    assert any("actors.upper" in k for k in changed)
+    logs = EventAccumulator(str(tmp_path))
+    logs.Reload()
+    assert [logs.Scalars(f"agents/{n}/skipped")[0].value for n in ("lower", "upper")] == [steps, 0.0]
+
+
+@pytest.mark.usefixtures("in_tmp_path")
+@pytest.mark.parametrize("fault", ["nan", "force"])
+def test_a_world_that_diverges_is_named_counted_and_contained(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, fault: str
+):
+    env = robots()
+    forces, calls = env._apply_forces, []
+
+    def planted() -> None:
+        forces()
+        calls.append(1)
+        if len(calls) == STEPS + 2:
+            if fault == "nan":
+                env.sim.qpos[3, 10] = math.nan
+            else:
+                env.sim.xfrc[3, 1, 2] = 1e12
+
+    monkeypatch.setattr(env, "_apply_forces", planted)
+    runner = make_runner(tmp_path, 3, env=env)
+    runner.learn()
+    assert "iteration 2: worlds diverged 1 times" in "".join(capsys.readouterr())
+    assert env.num_diverged == 1
+    content = load_checkpoint(checkpoint(tmp_path, 3))
+    for part in (content["model"], content["env"]["observations"]):
+        assert all(torch.isfinite(v).all() for v in part.values())
+
+
+def test_what_killed_processes_left_is_removed(tmp_path: Path):
+    for name in (".checkpoint_000002.abc.pt", ".config.xyz.json", ".mine"):
+        tmp_path.joinpath(name).write_bytes(b"part")
+    make_runner(tmp_path, 1).learn()
+    assert names(tmp_path) == [".mine", "checkpoint_000001.pt", "config.json"]
 
 
 def test_a_checkpoint_of_another_robot_is_refused_and_changes_nothing(tmp_path: Path):

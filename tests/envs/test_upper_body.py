@@ -185,7 +185,7 @@ def test_a_restarted_world_has_a_hand_that_felt_nothing(make_env):
     env.motions.hold(env.motions.default)
     for _ in range(25):
         env.step(torch.zeros(2, 19))
-    law = env.upper_body._laws[0][0]
+    law = next(iter(env.upper_body._laws.values()))[0]
     shift = (law.memory["position_h"] - law.memory["wanted_h"]).norm(dim=-1)
     assert shift[0].tolist() == pytest.approx([0.035, 0.0], abs=0.01)
     env.sim.qpos[1, 3:7] = torch.tensor([0.5**0.5, 0.5**0.5, 0.0, 0.0])  # on its side

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import io
 import json
 import os
+import reprlib
 import tempfile
-from collections.abc import Callable
+import zipfile
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +18,13 @@ import torch
 
 FORMAT = "cotap-checkpoint"
 VERSION = 1
+PARTS: dict[str, Any] = {
+    "kind": str, "layout": dict, "agents": dict, "config": dict, "model": dict, "learner": dict, "env": dict,
+    "iteration": int, "samples": int, "wall_seconds": (int, float), "rng": torch.Tensor,
+}  # fmt: skip
+"""What a checkpoint of a run holds; the parts of a shipped one may be empty."""
+MALFORMED = (RuntimeError, ValueError, TypeError, LookupError, AttributeError, OverflowError)
+"""What code that takes over a state raises where the state is not what it should be."""
 
 
 class CheckpointError(ValueError):
@@ -41,6 +51,26 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
         with contextlib.suppress(OSError):
             temporary.unlink()
         raise
+    _sync_folder(path.parent)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make a rename last through a power cut, where the system can."""
+    with contextlib.suppress(OSError):  # Windows opens no folders, and some file systems sync none
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+
+
+def remove_leftovers(folder: Path) -> int:
+    """Delete the temporary files that processes killed while saving have left in a run's folder. Returns how many."""
+    leftovers = [*folder.glob(".checkpoint_*.pt"), *folder.glob(".config.*.json")]
+    for path in leftovers:
+        with contextlib.suppress(OSError):
+            path.unlink()
+    return len(leftovers)
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -73,27 +103,60 @@ def load_checkpoint(path: Path | str, device: str = "cpu") -> dict[str, Any]:
         CheckpointError: the file is missing, truncated, foreign, or of another version.
     """
     path = Path(path)
-    if not path.is_file():
-        raise CheckpointError(f"checkpoint {str(path)!r} does not exist")
     try:
-        content = torch.load(path, map_location=device, weights_only=True)
+        if not path.is_file():
+            raise CheckpointError(f"checkpoint {str(path)!r} {'is no file' if path.exists() else 'does not exist'}")
+        data = path.read_bytes()
+    except (OSError, ValueError) as error:
+        if isinstance(error, CheckpointError):
+            raise
+        raise CheckpointError(f"checkpoint {str(path)!r} cannot be opened or read from disk: {error}") from error
+    try:
+        _refuse_compressed(data)
+        content = torch.load(io.BytesIO(data), map_location=device, weights_only=True)
     except Exception as error:  # on rubbish, torch's restricted unpickler raises whatever its reading stumbles over
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise CheckpointError(f"checkpoint {str(path)!r} cannot be read (truncated or foreign): {reason}") from error
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
+    if not isinstance(content, dict) or not _same(content.get("format"), FORMAT):
         raise CheckpointError(f"{str(path)!r} is not a cotap checkpoint")
-    if content.get("version") != VERSION:
+    if not _same(content.get("version"), VERSION):
         raise CheckpointError(f"{str(path)!r} has version {content.get('version')!r}; this cotap reads {VERSION}")
     return content
+
+
+def _refuse_compressed(data: bytes) -> None:
+    """Torch writes archives uncompressed; one that is compressed could unpack to more than any memory holds."""
+    if zipfile.is_zipfile(io.BytesIO(data)):
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            if any(entry.file_size > len(data) for entry in archive.infolist()):
+                raise ValueError("an entry unpacks to more than the whole file holds")
+
+
+def require_parts(path: Path | str, content: dict[str, Any], parts: Collection[str]) -> None:
+    """Raise CheckpointError naming the first of `parts` that is missing or not of the kind that `PARTS` says."""
+    for part in parts:
+        if part not in content:
+            raise CheckpointError(f"checkpoint {str(path)!r} lacks its part {part!r}")
+        value = content[part]
+        if not isinstance(value, PARTS[part]) or (isinstance(value, (int, float)) and not value >= 0):
+            raise CheckpointError(f"checkpoint {str(path)!r} has no usable part {part!r}: {reprlib.repr(value)}")
 
 
 def require_layout(path: Path | str, saved: dict[str, Any], present: dict[str, Any]) -> None:
     """Raise CheckpointError naming the first entry in which a checkpoint's layout differs from the environment's."""
     for key, value in present.items():
-        if saved.get(key) != value:
+        if not _same(saved.get(key), value):
             raise CheckpointError(
                 f"checkpoint {str(path)!r} was trained with another {key}: {saved.get(key)!r}, here {value!r}"
             )
+
+
+def _same(saved: Any, expected: Any) -> bool:
+    """Whether plain data are equal; a file may hold tensors in their place, whose comparison is no truth value."""
+    try:
+        return type(saved) is type(expected) and bool(saved == expected)
+    except (RuntimeError, ValueError):
+        return False
 
 
 def sha256(path: Path | str) -> str:

@@ -21,7 +21,8 @@ from cotap.agents.losses import (
     generalized_advantages,
 )
 from cotap.agents.precision import PRECISIONS, resolve_precision
-from cotap.checks import require_one_of, require_positive_int, require_range
+from cotap.agents.ranks import Ranks
+from cotap.checks import require_one_of, require_positive_int, require_range, require_shape
 
 
 @dataclass
@@ -116,14 +117,16 @@ class DualPPO:
         cfg: Hyperparameters.
         device: Where the networks live.
         guide: A frozen policy that agents are kept close to at first; None for none.
+        ranks: The processes that learn as one, each from its own `num_envs` worlds.
     """
 
     def __init__(
-        self, layout: AgentLayout, num_envs: int, cfg: DualPPOConfig, device: str = "cpu", guide: Guide | None = None
-    ) -> None:
+        self, layout: AgentLayout, num_envs: int, cfg: DualPPOConfig, device: str = "cpu", guide: Guide | None = None,
+        ranks: Ranks | None = None,
+    ) -> None:  # fmt: skip
         cfg.check()
         self.cfg, self.device, self.layout = cfg, device, layout
-        self.guide = guide
+        self.guide, self.ranks = guide, ranks or Ranks()
         self.dtype = resolve_precision(cfg.precision, device)
         self.names = tuple(layout.action_slices)
         self.model = DualActorCritic(layout, cfg.hidden, cfg.initial_std).to(device)
@@ -160,6 +163,7 @@ class DualPPO:
             rewards=buffer(g),
             dones=buffer(1, torch.bool),
         )
+        self._kl = nn.Parameter(torch.zeros(1, device=device))
         self._step = 0
         self.iterations = 0
 
@@ -206,12 +210,12 @@ class DualPPO:
             last = torch.cat([model.critics[n](x) for n in self.names], -1)
         advantages = generalized_advantages(r.rewards, r.values, last, r.dones, self.cfg.gamma, self.cfg.lam)
         r.returns = advantages + r.values
-        flat = advantages.flatten(0, 1)
-        r.advantages = (advantages - flat.mean(0)) / (flat.std(0) + 1e-8)
+        r.advantages = self.ranks.standardize(advantages.flatten(0, 1)).unflatten(0, advantages.shape[:2])
         self._step = 0
 
     def update(self) -> dict[str, float]:
-        """Learn from the rollout. Returns mean losses, KL and learning rate per agent, for the log."""
+        """Learn from the rollout. Returns mean losses, KL and learning rate per agent, and how many steps were skipped
+        because their gradient was not finite, for the log."""
         r, cfg = self.rollout, self.cfg
         flat = {
             key: getattr(r, key).flatten(0, 1)
@@ -223,6 +227,7 @@ class DualPPO:
         old_log_std = {n: self.model.log_std[n].detach().clone() for n in self.names}
         total = flat["actions"].shape[0]
         sums: dict[str, torch.Tensor] = {}
+        skipped = dict.fromkeys(self.names, 0)
         for _ in range(cfg.epochs):
             for ids in torch.randperm(total, device=self.device).chunk(cfg.mini_batches):
                 batch = {key: value[ids] for key, value in flat.items()}
@@ -231,13 +236,17 @@ class DualPPO:
                     actor_in, critic_in = self.model.read("actor", inputs), self.model.read("critic", inputs)
                 for g, name in enumerate(self.names):
                     stats = self._update_agent(name, g, actor_in, critic_in, batch, old_log_std[name])
+                    if stats is None:
+                        skipped[name] += 1
+                        continue
                     for key, value in stats.items():
                         sums[f"{name}/{key}"] = sums.get(f"{name}/{key}", torch.zeros(())) + value
         self.iterations += 1
         self._limit_std()
-        count = cfg.epochs * cfg.mini_batches
-        log = {key: float(value) / count for key, value in sums.items()}
+        count = {name: max(1, cfg.epochs * cfg.mini_batches - skipped[name]) for name in self.names}
+        log = {key: float(value) / count[key.partition("/")[0]] for key, value in sums.items()}
         for name in self.names:
+            log[f"{name}/skipped"] = float(skipped[name])
             log[f"{name}/learning_rate"] = self.learning_rates[name]
             if self.guide and name in self.guide.cfg.agents:
                 log[f"{name}/base_beta"] = self.guide.beta(self.iterations - 1)
@@ -254,7 +263,8 @@ class DualPPO:
     def _update_agent(
         self, name: str, g: int, actor_in: torch.Tensor, critic_in: torch.Tensor, batch: dict[str, torch.Tensor],
         old_log_std: torch.Tensor,
-    ) -> dict[str, torch.Tensor]:  # fmt: skip
+    ) -> dict[str, torch.Tensor] | None:  # fmt: skip
+        """Statistics of the step, or None if its gradient is not finite and nothing was learned from it."""
         cfg, model = self.cfg, self.model
         part = self.layout.action_slices[name]
         with self._autocast():
@@ -263,7 +273,6 @@ class DualPPO:
         log_std = model.log_std[name]
         with torch.no_grad():
             kl = gaussian_kl(batch["means"][:, part], old_log_std, mean, log_std).mean()
-        self.learning_rates[name] = adapt_learning_rate(self.learning_rates[name], float(kl), cfg.desired_kl)
         log_prob = gaussian_log_prob(batch["actions"][:, part], mean, log_std)
         surrogate = clipped_surrogate(log_prob, batch["log_probs"][:, g], batch["advantages"][:, g], cfg.clip)
         value_loss = clipped_value_loss(value, batch["values"][:, g], batch["returns"][:, g], cfg.clip)
@@ -279,8 +288,14 @@ class DualPPO:
         optimizer = self.optimizers[name]
         optimizer.zero_grad()
         loss.backward()
-        nn.utils.clip_grad_norm_([*model.actors[name].parameters(), log_std], cfg.max_grad_norm)
-        nn.utils.clip_grad_norm_(model.critics[name].parameters(), cfg.max_grad_norm)
+        own = [*model.actors[name].parameters(), log_std, *model.critics[name].parameters()]
+        self._kl.grad = kl.reshape(1)  # travels with the gradients: one message instead of two
+        self.ranks.average_gradients([*own, self._kl])
+        self.learning_rates[name] = adapt_learning_rate(self.learning_rates[name], float(self._kl.grad), cfg.desired_kl)
+        norm = nn.utils.clip_grad_norm_([*model.actors[name].parameters(), log_std], cfg.max_grad_norm)
+        norm += nn.utils.clip_grad_norm_(model.critics[name].parameters(), cfg.max_grad_norm)
+        if not torch.isfinite(norm):
+            return None
         for group in optimizer.param_groups:
             group["lr"] = self.learning_rates[name]
         optimizer.step()
@@ -296,10 +311,16 @@ class DualPPO:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over what `state_dict` returned."""
+        """Take over what `state_dict` returned. Raises ValueError for moments of another size than the weights."""
         for name, opt in self.optimizers.items():
             opt.load_state_dict(state["optimizers"][name])
-        self.learning_rates = dict(state["learning_rates"])
-        self.iterations = state["iterations"]
+            for parameter, moments in opt.state.items():
+                for key in ("exp_avg", "exp_avg_sq"):
+                    require_shape(f"optimizers.{name}.{key}", moments[key], tuple(parameter.shape))
+        self.learning_rates = {
+            name: require_range(f"learning_rates.{name}", state["learning_rates"][name], 0.0, 1.0)
+            for name in self.names
+        }
+        self.iterations = int(state["iterations"])
         if self.guide and state["guide"]:
             self.guide.load_state_dict(state["guide"])

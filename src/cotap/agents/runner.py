@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -14,13 +16,24 @@ from typing import Any
 import torch
 from rsl_rl.env import VecEnv
 from rsl_rl.runners import OnPolicyRunner
-from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-from cotap.agents.actors import AgentLayout, as_dict
-from cotap.agents.checkpoint import CheckpointError, load_checkpoint, require_layout, save_checkpoint, write_json
+from cotap.agents.actors import AgentLayout, Observations, as_dict
+from cotap.agents.checkpoint import (
+    MALFORMED,
+    PARTS,
+    CheckpointError,
+    load_checkpoint,
+    remove_leftovers,
+    require_layout,
+    require_parts,
+    save_checkpoint,
+    write_json,
+)
 from cotap.agents.distillation import Guide
 from cotap.agents.dual_ppo import DualPPO, DualPPOConfig
+from cotap.agents.ranks import Ranks
+from cotap.agents.run_log import RunLog, Unfailing, say
 from cotap.checks import require_positive_int
 
 CHECKPOINT_PATTERN = "checkpoint_*.pt"
@@ -34,6 +47,8 @@ class RunnerConfig:
     """Iterations in all, those of a resumed run included."""
     save_interval: int = 25
     """Iterations between checkpoints."""
+    save_worlds: bool = True
+    """Save every world's state (14 kB), so that a run goes on exactly; without, worlds start afresh."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
@@ -49,7 +64,7 @@ def layout_of(env: VecEnv, symmetric: bool = True) -> AgentLayout:
 
 
 def check_run_dir(run_dir: Path, resuming: bool) -> None:
-    """Refuse a directory that holds another run, or that cannot be written to.
+    """Refuse a directory that holds another run's checkpoints, or that cannot be written to.
 
     Raises:
         ValueError: the directory is used; the message says what to do.
@@ -57,19 +72,26 @@ def check_run_dir(run_dir: Path, resuming: bool) -> None:
     """
     if run_dir.exists() and not run_dir.is_dir():
         raise ValueError(f"run directory {str(run_dir)!r} is a file")
-    if not resuming and ((run_dir / "config.json").exists() or any(run_dir.glob(CHECKPOINT_PATTERN))):
-        newest = max(run_dir.glob(CHECKPOINT_PATTERN), default=None)
-        way_on = f"go on with --resume {newest}, or choose" if newest else "it has no checkpoint to go on from; choose"
-        raise ValueError(f"run directory {str(run_dir)!r} already holds a run; {way_on} another --run-dir")
+    newest = max(run_dir.glob(CHECKPOINT_PATTERN), default=None)
+    if newest and not resuming:
+        raise ValueError(
+            f"run directory {str(run_dir)!r} already holds a run; "
+            f"go on with --resume {newest}, or choose another --run-dir"
+        )
     run_dir.mkdir(parents=True, exist_ok=True)
     probe = run_dir / ".writable"
     probe.touch()
     probe.unlink()
 
 
+class TrainingFault(RuntimeError):
+    """An iteration that could not be finished; the message says why, and what to go on from."""
+
+
 class DualRunner(OnPolicyRunner):
     """rsl_rl's runner for two agents. Replaces its loop, its saving (all that a run depends on) and its loading
-    (no code is run from a file); needs an environment with `action_slices`, `obs_groups` and `state_dict`.
+    (no code is run from a file); needs an environment with `action_slices`, `obs_groups` and `state_dict`, and among
+    several ranks with `keep_in_step`.
 
     Args:
         env: The environment.
@@ -79,83 +101,167 @@ class DualRunner(OnPolicyRunner):
         config: The resolved config as plain data, saved beside the run and in every checkpoint.
         device: Where the networks live.
         guide: A frozen policy to stay close to at first.
+        ranks: The processes that learn as one. All call every method alike; rank 0 writes what is written.
     """
 
     def __init__(
         self, env: VecEnv, cfg: RunnerConfig, ppo: DualPPOConfig, run_dir: Path, config: dict[str, Any],
-        device: str = "cpu", guide: Guide | None = None,
+        device: str = "cpu", guide: Guide | None = None, ranks: Ranks | None = None,
     ) -> None:  # fmt: skip
         cfg.check()
         self.env, self.runner_cfg, self.run_dir, self.config, self.device = env, cfg, run_dir, config, device
-        self.alg: DualPPO = DualPPO(layout_of(env, ppo.symmetric), env.num_envs, ppo, device, guide)  # pyright: ignore
+        self.ranks = ranks = ranks or Ranks()
+        layout = layout_of(env, ppo.symmetric)
+        self.alg: DualPPO = DualPPO(layout, env.num_envs, ppo, device, guide, ranks)  # pyright: ignore
         self.current_learning_iteration = 0
         self.wall_seconds = 0.0
-        self._stop = False
+        self.failed_saves = 0
+        self._saved = -1
+        self._save_failed = self._stop = False
+        self._kept: dict[str, Any] = {}
 
     def learn(self, num_learning_iterations: int | None = None, init_at_random_ep_len: bool = False) -> None:
-        """Train up to `runner.iterations` in all (or for so many more), saving at intervals and at the end."""
-        env, alg = self.env, self.alg
+        """Train up to `runner.iterations` in all (or for so many more), saving at intervals and at the end.
+
+        A save that fails (a full disk) is reported and tried again after every iteration; worlds that diverge and
+        steps that are skipped are reported as they are counted.
+
+        Raises:
+            TrainingFault: an iteration failed; the message says what to go on from.
+            OSError: the last save failed, or logs cannot be written from the start.
+        """
+        env, alg, ranks = self.env, self.alg, self.ranks
         self._stop = False
         first = self.current_learning_iteration
         last = self.runner_cfg.iterations if num_learning_iterations is None else first + num_learning_iterations
         if init_at_random_ep_len and first == 0:
             env.episode_length_buf = torch.randint_like(env.episode_length_buf, high=int(env.max_episode_length))
-        write_json(self.run_dir / "config.json", self.config)
-        writer = SummaryWriter(str(self.run_dir), purge_step=env.samples + 1)  # pyright: ignore[reportAttributeAccessIssue]
-        precision = str(alg.dtype).removeprefix("torch.")
-        tqdm.write(f"{env.num_envs} worlds, networks {alg.cfg.hidden} in {precision} on {self.device}, {self.run_dir}")
+        ranks.same_everywhere(alg.model)
+        run_log = None
+        if ranks.leads:
+            remove_leftovers(self.run_dir)
+            write_json(self.run_dir / "config.json", self.config)
+            run_log = RunLog(self.run_dir, env.samples)  # pyright: ignore[reportAttributeAccessIssue]
+            precision = str(alg.dtype).removeprefix("torch.")
+            processes = f"{ranks.size} x " if ranks.size > 1 else ""
+            worlds = f"{processes}{env.num_envs} worlds"
+            say(f"{worlds}, networks {alg.cfg.hidden} in {precision} on {self.device}, {self.run_dir}")
         obs = self._observations()
-        saved = -1
-        with self._signals(), tqdm(total=last, initial=first, unit="it", dynamic_ncols=True) as bar:
+        self._saved = -1
+        bar = tqdm(
+            total=last, initial=first, unit="it", dynamic_ncols=True, disable=not ranks.leads,
+            file=Unfailing(sys.stderr),
+        )  # fmt: skip
+        with self._signals(), bar:
             for it in range(first, last):
-                start = time.perf_counter()
-                log: dict[str, torch.Tensor] = {}
-                for _ in range(alg.cfg.steps):
-                    _, _, dones, extras = env.step(alg.act(obs).to(env.device))
-                    obs = self._observations()
-                    alg.process_step(
-                        extras["group_rewards"].to(self.device),
-                        dones.to(self.device),
-                        extras["time_outs"].to(self.device),
-                    )
-                    for key, value in extras["log"].items():
-                        log[key] = log.get(key, torch.zeros(())) + value
-                alg.compute_returns(obs)
-                collected = time.perf_counter()
-                scalars = {key.lstrip("/"): float(value) / alg.cfg.steps for key, value in log.items()}
-                scalars |= {f"agents/{key}": value for key, value in alg.update().items()}
-                end = time.perf_counter()
-                self.wall_seconds += end - start
-                batch = alg.cfg.steps * env.num_envs
-                scalars |= {
-                    "throughput/steps_per_s": batch / (end - start),
-                    "throughput/collect_s": collected - start,
-                    "throughput/learn_s": end - collected,
-                }
-                self.current_learning_iteration = it + 1
-                for key, value in scalars.items():
-                    writer.add_scalar(key, value, env.samples)  # pyright: ignore[reportAttributeAccessIssue]
+                try:
+                    obs, scalars = self._iterate(obs)
+                    stopping = ranks.any(self._stop)
+                    self.current_learning_iteration = it + 1
+                    if ranks.size > 1:
+                        self._kept = copy.deepcopy(self._content(worlds=False))
+                    if run_log:
+                        self._log(run_log, scalars)
+                    if (it + 1) % self.runner_cfg.save_interval == 0 or self._save_failed:
+                        self._save_or_report()
+                except Exception as error:
+                    raise TrainingFault(self._fault(it + 1, error)) from error
                 bar.update()
                 bar.set_postfix_str(_summary(scalars))
-                if (it + 1) % self.runner_cfg.save_interval == 0:
-                    self.save()
-                    saved = it + 1
-                if self._stop:
-                    tqdm.write("stopping: saving a checkpoint")
+                if stopping:
+                    say("stopping: saving a checkpoint")
                     break
-            if saved != self.current_learning_iteration:
+            if self._saved != self.current_learning_iteration:
                 self.save()
-        writer.close()
+        if run_log:
+            run_log.close()
+
+    def _log(self, run_log: RunLog, scalars: dict[str, float]) -> None:
+        scalars |= {"faults/failed_saves": self.failed_saves, "faults/lost_log_records": run_log.lost}
+        if reason := run_log.write(scalars, self.env.samples):  # pyright: ignore[reportAttributeAccessIssue]
+            where = f"iteration {self.current_learning_iteration}"
+            say(f"{where}: its log record could not be written ({reason})")
+
+    def _iterate(self, obs: Observations) -> tuple[Observations, dict[str, float]]:
+        """Collect a rollout and learn from it. Returns the observations after it, and what to log."""
+        env, alg = self.env, self.alg
+        start = time.perf_counter()
+        diverged = getattr(env, "num_diverged", 0)
+        log: dict[str, torch.Tensor] = {}
+        for _ in range(alg.cfg.steps):
+            _, _, dones, extras = env.step(alg.act(obs).to(env.device))
+            obs = self._observations()
+            alg.process_step(
+                extras["group_rewards"].to(self.device), dones.to(self.device), extras["time_outs"].to(self.device)
+            )
+            for key, value in extras["log"].items():
+                log[key] = log.get(key, torch.zeros(())) + value
+        alg.compute_returns(obs)
+        collected = time.perf_counter()
+        scalars = {key.lstrip("/"): float(value) / alg.cfg.steps for key, value in log.items()}
+        learned = alg.update()
+        scalars |= {f"agents/{key}": value for key, value in learned.items()}
+        end = time.perf_counter()
+        self.wall_seconds += end - start
+        scalars |= {
+            "throughput/steps_per_s": self.ranks.size * alg.cfg.steps * env.num_envs / (end - start),
+            "throughput/collect_s": collected - start,
+            "throughput/learn_s": end - collected,
+        }
+        self._report(getattr(env, "num_diverged", 0) - diverged, learned)
+        if self.ranks.size > 1:
+            env.keep_in_step(self.ranks.mean)  # pyright: ignore[reportAttributeAccessIssue]
+        return obs, self.ranks.mean_of(scalars)
+
+    def _report(self, diverged: int, learned: dict[str, float]) -> None:
+        """Name in the log what went wrong in an iteration and was contained."""
+        where = f"iteration {self.current_learning_iteration + 1}"
+        if diverged:
+            say(f"{where}: worlds diverged {diverged} times; each was ended, counted and started again")
+        for name in self.alg.names:
+            if skipped := learned[f"{name}/skipped"]:
+                say(f"{where}: {skipped:.0f} steps of agent {name!r} skipped, their gradient was not finite")
+
+    def _fault(self, iteration: int, error: Exception) -> str:
+        """Why an iteration failed and what to go on from. With other ranks, any of which may be the one that is lost,
+        every rank that still runs sees to it that what the last whole iteration learned is saved."""
+        if self._kept:
+            target = self.run_dir / f"checkpoint_{self._kept['iteration']:06d}.pt"
+            try:
+                if not target.exists():
+                    save_checkpoint(target, self._kept)
+            except OSError as failed:
+                say(f"what was learned last could not be saved: {failed}")
+        newest = max(self.run_dir.glob(CHECKPOINT_PATTERN), default=None)
+        way_on = f"go on with --resume {newest}" if newest else "there is no checkpoint yet to go on from"
+        what = f"{type(error).__name__}: {error}"
+        return f"iteration {iteration} failed ({what}); {way_on}"
+
+    def _save_or_report(self) -> None:
+        """Save; if it fails, count it and say so: the run goes on, and every iteration tries again."""
+        failed = False
+        try:
+            self.save()
+        except OSError as error:
+            failed = True
+            self.failed_saves += 1
+            say(f"iteration {self.current_learning_iteration}: {error}; trying again after the next iteration")
+        self._save_failed = self.ranks.any(failed)
+        if self._save_failed:
+            self._saved = -1  # on every rank: those that have nothing to write must try along
 
     def save(self, path: str | None = None, infos: dict | None = None) -> None:
         """Save everything to go on exactly; the previous checkpoint then sheds its simulator states."""
         if self.alg.guide:
             self.alg.guide.verify()
         target = Path(path) if path else self.run_dir / f"checkpoint_{self.current_learning_iteration:06d}.pt"
-        save_checkpoint(target, self._content() | {"infos": infos or {}})
-        older = [path for path in self.run_dir.glob(CHECKPOINT_PATTERN) if path < target]
-        if older:
-            _shed_simulator_states(max(older))
+        others = self.ranks.gather(self._own_state)
+        if self.ranks.leads:
+            save_checkpoint(target, self._content() | {"others": others, "infos": infos or {}})
+            older = [path for path in self.run_dir.glob(CHECKPOINT_PATTERN) if path < target]
+            if older:
+                _shed_simulator_states(max(older))
+        self._saved = self.current_learning_iteration
 
     def load(self, path: str, *_: Any, map_location: str | None = None, **__: Any) -> dict:
         """Load a checkpoint. What it lacks (a shipped one has no optimiser or simulator states) starts afresh.
@@ -164,33 +270,47 @@ class DualRunner(OnPolicyRunner):
             CheckpointError: the file cannot be used, or was trained for another robot or observation layout.
         """
         content = load_checkpoint(path, map_location or self.device)
-        for part in ("layout", "config", "model", "learner", "env", "iteration", "samples", "wall_seconds", "rng"):
-            if part not in content:
-                raise CheckpointError(f"checkpoint {path!r} lacks its part {part!r}")
+        require_parts(path, content, PARTS.keys() - {"agents", "kind"})
         env: Any = self.env
         require_layout(path, content["layout"], json.loads(json.dumps(env.layout())))
         try:
             self.alg.model.load_state_dict(content["model"])
-        except RuntimeError as error:
+        except MALFORMED as error:
             raise CheckpointError(f"checkpoint {path!r} has other networks: {error}") from error
         fresh: list[str] = []
-        if content["learner"]:
-            self.alg.load_state_dict(content["learner"])
-            self.current_learning_iteration = content["iteration"]
-            self.wall_seconds = content["wall_seconds"]
-            torch.set_rng_state(content["rng"].cpu())
-        else:
-            fresh.append("optimisers")
-        if content["env"] and content["env"]["episode_length"].shape[0] == env.num_envs:
-            env.load_state_dict(content["env"])
-        else:
-            env.samples = content["samples"]
-            fresh.append("simulator states")
+        try:
+            if content["learner"]:
+                self.alg.load_state_dict(content["learner"])
+                self.current_learning_iteration = content["iteration"]
+                self.wall_seconds = float(content["wall_seconds"])
+            else:
+                fresh.append("optimisers")
+            mine = self._share_of(content)
+            if content["learner"] and mine["rng"] is not None:
+                torch.set_rng_state(mine["rng"].cpu())
+            if mine["env"] and mine["env"]["episode_length"].shape[0] == env.num_envs:
+                env.load_state_dict(mine["env"])
+            else:
+                env.samples = content["samples"]
+                fresh.append("simulator states")
+        except MALFORMED as error:
+            raise CheckpointError(f"checkpoint {path!r} has states that do not fit this run: {error}") from error
         if fresh:
-            tqdm.write(f"{path}: no {' and '.join(fresh)} for this run; starting those afresh")
+            say(f"{path}: no {' and '.join(fresh)} for this run; starting those afresh")
         return content.get("infos", {})
 
-    def _content(self) -> dict[str, Any]:
+    def _share_of(self, content: dict[str, Any]) -> dict[str, Any]:
+        """This rank's worlds and random numbers in a checkpoint; none, if it is of another number of ranks."""
+        states = [content, *content.get("others", [])]
+        same_number = len(states) == self.ranks.size
+        return states[self.ranks.rank] if same_number else {"env": {}, "rng": None}
+
+    def _own_state(self) -> dict[str, Any]:
+        """What is this rank's own."""
+        env: Any = self.env
+        return {"env": env.state_dict() if self.runner_cfg.save_worlds else {}, "rng": torch.get_rng_state()}
+
+    def _content(self, worlds: bool = True) -> dict[str, Any]:
         env: Any = self.env
         return {
             "kind": self.config.get("stage", "base"),
@@ -199,11 +319,10 @@ class DualRunner(OnPolicyRunner):
             "config": self.config,
             "model": self.alg.model.state_dict(),
             "learner": self.alg.state_dict(),
-            "env": env.state_dict(),
+            **(self._own_state() if worlds else {"env": {}, "rng": torch.get_rng_state()}),
             "iteration": self.current_learning_iteration,
             "samples": env.samples,
             "wall_seconds": self.wall_seconds,
-            "rng": torch.get_rng_state(),
         }
 
     def _observations(self) -> dict[str, torch.Tensor]:
@@ -232,13 +351,15 @@ class DualRunner(OnPolicyRunner):
 
 
 def _shed_simulator_states(path: Path) -> None:
-    """Only a run's newest checkpoint keeps them; a file that is no checkpoint is left as it is."""
+    """Only a run's newest checkpoint keeps them; a file that is no checkpoint, or cannot be replaced, is left."""
     try:
         content = load_checkpoint(path)
+        if content.get("env"):
+            save_checkpoint(path, content | {"env": {}, "others": []})
     except CheckpointError:
         return
-    if content.get("env"):
-        save_checkpoint(path, content | {"env": {}})
+    except OSError as error:  # a disk that has just become full
+        say(f"{path} keeps its simulator states: {error}")
 
 
 def _summary(s: dict[str, float]) -> str:

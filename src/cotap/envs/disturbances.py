@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -191,6 +192,10 @@ class Assistance(Stateful):
         direction = (1.0 - self._fall_rate / self.cfg.fall_rate).clamp(-1.0, 1.0)
         progress = self._num_envs / self.cfg.fade_samples
         self._share = (self._share * torch.exp(-progress * direction)).clamp_max(1.0)
+
+    def keep_in_step(self, mean: Callable[[torch.Tensor], torch.Tensor]) -> None:
+        """Take over the mean over processes of what is left and of falls."""
+        self._share, self._fall_rate = mean(self._share), mean(self._fall_rate)
 
 
 def assist_wrench(

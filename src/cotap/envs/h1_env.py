@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import torch
 from rsl_rl.env import VecEnv
@@ -29,7 +30,7 @@ from cotap.envs.observations import (
     critic_terms,
     noise_amplitude,
 )
-from cotap.envs.persistence import uniform
+from cotap.envs.persistence import restored, uniform
 from cotap.envs.punches import PunchConfig, Punches
 from cotap.envs.randomization import RandomizationConfig, Randomizer
 from cotap.envs.reference import ReferenceConfig, ReferenceMotion
@@ -125,6 +126,10 @@ class H1Env(VecEnv):
     `action_slices` and `reward_groups` tell agents, by name, which actions and which reward are theirs; `step` returns
     the sum of the groups' rewards, and each group's in `extras["group_rewards"]` (N, groups).
 
+    Args:
+        cfg: What defines it.
+        processes: How many learn as one, each with as many worlds: `samples`, and what fades with them, counts all.
+
     Raises:
         ValueError: a field of the config is out of its range.
     """
@@ -132,9 +137,10 @@ class H1Env(VecEnv):
     cfg: H1EnvConfig  # pyright: ignore[reportIncompatibleVariableOverride]
     reward_groups = ("lower", "upper")
 
-    def __init__(self, cfg: H1EnvConfig | None = None) -> None:
+    def __init__(self, cfg: H1EnvConfig | None = None, processes: int = 1) -> None:
         self.cfg = cfg = cfg or H1EnvConfig()
         cfg.check()
+        self._worlds_in_all = cfg.num_envs * require_positive_int("processes", processes)
         self.device = "cpu"
         self.num_envs = n = cfg.num_envs
         self.spec = spec = ROBOTS[cfg.robot]()
@@ -181,7 +187,7 @@ class H1Env(VecEnv):
         self.blows = Blows(cfg.blows, n, len(spec.arms), self.dt)
         self.scripted = ScriptedForces(cfg.force, tuple(arm.side for arm in spec.arms), n, self.dt)
         self.punches = Punches(cfg.punches, n, self.num_actions - self.num_lower, self.dt)
-        self.assistance = Assistance(cfg.assist, n, self.dt)
+        self.assistance = Assistance(cfg.assist, self._worlds_in_all, self.dt)
         self.randomizer = Randomizer(cfg.randomization, spec, self.sim)
         self.upper_body = UpperBody(cfg.upper_body, spec, n, self.dt)
         self.targets = DelayedTargets(n, self.num_actions, cfg.substeps, self.dt)
@@ -289,7 +295,7 @@ class H1Env(VecEnv):
 
         bad = diverged(self.sim.qpos, self.sim.qvel)
         self.state = self.reader.read()
-        self.samples += self.num_envs
+        self.samples += self._worlds_in_all
         self.episode_length_buf += 1
         s = self.state
         self.commands.step(self.rng, leaning(s.projected_gravity_t, s.torso_angular_velocity_t))
@@ -372,17 +378,23 @@ class H1Env(VecEnv):
         self.sim.restore(Snapshot(**state["sim"]))
         for name, part in self._parts().items():
             part.load_state_dict(state["parts"][name])
-        for name, value in state["delay"].items():
-            setattr(self.targets, name, value.clone())
+        for name in ("delay_s", "previous", "current"):
+            setattr(self.targets, name, restored(f"delay.{name}", state["delay"][name], getattr(self.targets, name)))
         self._kp, self._kd = self.randomizer.gains()
-        self.episode_length_buf = state["episode_length"].clone()
-        self._last_action = state["last_action"].clone()
-        self._mean_error = state["mean_error"].clone()
-        self._observations = TensorDict(state["observations"], batch_size=[self.num_envs])
+        self.episode_length_buf = restored("episode_length", state["episode_length"], self.episode_length_buf)
+        self._last_action = restored("last_action", state["last_action"], self._last_action)
+        self._mean_error = restored("mean_error", state["mean_error"], self._mean_error)
+        present = {k: cast(torch.Tensor, v) for k, v in self._observations.items()}
+        saved = {k: restored(f"observations.{k}", state["observations"][k], v) for k, v in present.items()}
+        self._observations = TensorDict(saved, batch_size=[self.num_envs])
         self.samples = state["counters"]["samples"]
         self.num_diverged = state["counters"]["num_diverged"]
         self.rng.set_state(state["rng"])
         self.state = self.reader.read()
+
+    def keep_in_step(self, mean: Callable[[torch.Tensor], torch.Tensor]) -> None:
+        """Replace what all worlds share, and learn from their falls, by its mean over processes."""
+        self.assistance.keep_in_step(mean)
 
     def _parts(self) -> dict[str, Any]:
         return {

@@ -23,8 +23,15 @@ class Stateful:
         if state.keys() != set(self.STATE):
             raise ValueError(f"{type(self).__name__} expects state {sorted(self.STATE)}, got {sorted(state)}")
         for name in self.STATE:
-            own: torch.Tensor = getattr(self, name)
-            setattr(self, name, require_shape(f"{type(self).__name__}.{name}", state[name], tuple(own.shape)).clone())
+            setattr(self, name, restored(f"{type(self).__name__}.{name}", state[name], getattr(self, name)))
+
+
+def restored(name: str, value: Any, like: torch.Tensor) -> torch.Tensor:
+    """A copy of `value`, which was saved where `like` is now. Raises ValueError for another kind, size or type."""
+    if not isinstance(value, torch.Tensor) or value.dtype != like.dtype:
+        kind = value.dtype if isinstance(value, torch.Tensor) else type(value).__name__
+        raise ValueError(f"{name} must be a tensor of {like.dtype}, got {kind}")
+    return require_shape(name, value, tuple(like.shape)).clone()
 
 
 def uniform(rng: torch.Generator, low: float, high: float, *shape: int) -> torch.Tensor:

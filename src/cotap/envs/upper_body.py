@@ -14,7 +14,7 @@ from cotap.compliance.interface import ArmState, LawParameters, Remembering, Tor
 from cotap.compliance.laws import LAWS, LawConfig
 from cotap.compliance.torso import chain_compliance, hand_base_compliance, torso_compliance
 from cotap.envs.hand_sensing import HandSensors
-from cotap.envs.persistence import Stateful, uniform
+from cotap.envs.persistence import Stateful, restored, uniform
 from cotap.envs.state import RobotState
 from cotap.robots import RobotSpec
 from cotap.robots.chains import arm_model, chains_between
@@ -248,7 +248,10 @@ class UpperBody(Stateful):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take over what `state_dict` returned. Raises ValueError for another size or a missing name."""
         own = dict(state)
-        self.parameters = LawParameters(**{k: v.clone() for k, v in own.pop("parameters").items()})
+        saved, present = own.pop("parameters"), vars(self.parameters)
+        if saved.keys() != present.keys():
+            raise ValueError(f"UpperBody.parameters expects {sorted(present)}, got {sorted(saved)}")
+        parameters = {k: restored(f"UpperBody.parameters.{k}", saved[k], v) for k, v in present.items()}
         # States from before laws had senses and memories are of laws that need none.
         if "sensors" in own:
             self.sensors.load_state_dict(own.pop("sensors"))
@@ -258,6 +261,7 @@ class UpperBody(Stateful):
         for law, memory in zip(remembering, memories, strict=True):
             law.memory = {k: v.clone() for k, v in memory.items()}
         super().load_state_dict(own)
+        self.parameters = LawParameters(**parameters)
 
     def _remembering(self) -> list[Remembering]:
         return [law for law, *_ in self._laws.values() if isinstance(law, Remembering)]

@@ -10,8 +10,8 @@ from typing import Any
 import torch
 
 from cotap.agents.actors import AgentLayout, DualActorCritic
-from cotap.agents.checkpoint import CheckpointError, load_checkpoint
-from cotap.checks import require_one_of
+from cotap.agents.checkpoint import MALFORMED, CheckpointError, load_checkpoint, require_parts
+from cotap.checks import require_one_of, require_positive_int
 
 CHECKPOINTS = ("base", "cotap", "cotap-no-ratio", "cotap-torque-critic", "cotap-goals")
 """Names under which checkpoints are shipped: both stages, and the second stage's ablations."""
@@ -63,15 +63,14 @@ def load_policy(path: Path | str) -> Policy:
         CheckpointError: the file cannot be used.
     """
     content = load_checkpoint(path)
-    for part in ("layout", "model", "agents", "config", "kind"):
-        if part not in content:
-            raise CheckpointError(f"checkpoint {str(path)!r} lacks its part {part!r}")
+    require_parts(path, content, ("layout", "model", "agents", "config", "kind"))
     layout, weights, agents = content["layout"], content["model"], content["agents"]
-    hidden = tuple(content["config"]["training"]["ppo"]["hidden"])
     try:
+        widths = content["config"]["training"]["ppo"]["hidden"]
+        hidden = tuple(require_positive_int(f"ppo.hidden[{i}]", width) for i, width in enumerate(widths))
         model = DualActorCritic(AgentLayout.from_plain(agents), hidden, 1.0)
         model.load_state_dict(weights)
-    except (RuntimeError, ValueError, TypeError, LookupError) as error:
+    except MALFORMED as error:
         raise CheckpointError(f"checkpoint {str(path)!r} has networks that do not fit its config: {error}") from error
     model.eval()
     return Policy(model, layout, content["config"], content["kind"])

@@ -1,0 +1,504 @@
+"""Injects faults into small trainings and shows what survives: kills at random moments, disks that fill or turn
+read-only, clocks that jump, worlds that diverge, steps that raise. Prints a table; POSIX only.
+
+Every training is a forked process that runs the training command itself. One run that nothing happens to is what all
+others must end equal to, bit for bit.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import ctypes
+import json
+import math
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from cotap import train
+from cotap.agents.checkpoint import load_checkpoint
+from cotap.agents.dual_ppo import DualPPO
+from cotap.agents.runner import CHECKPOINT_PATTERN
+from cotap.envs import H1Env
+
+ITERATIONS, INTERVAL, STEPS, WORLDS, SICK = 12, 2, 4, 16, 3
+"""Of every training: iterations, iterations between saves, steps per iteration, worlds, and the world that is hurt."""
+OPTIONS = [
+    "base", "--num-envs", WORLDS, "--iterations", ITERATIONS, "--threads", 1, "--ppo.hidden", 8, 8, "--ppo.steps",
+    STEPS, "--ppo.precision", "fp32", "--runner.save-interval", INTERVAL,
+]  # fmt: skip
+Prepare = Callable[[], None]
+
+
+@dataclass
+class Row:
+    """One line of the table."""
+
+    fault: str
+    injected: int
+    survived: int
+    most_lost: int | None
+    """Iterations, in the worst case; None where it cannot be said."""
+    outcome: str
+
+
+class Run:
+    """A training in a process of its own, watched from outside."""
+
+    def __init__(self, folder: Path, prepare: Prepare | None = None, log: Path | None = None) -> None:
+        self.folder = folder
+        self.start = newest_iteration(folder)
+        resume = ["--resume", newest(folder)] if self.start else ["--run-dir", folder]
+        if not self.start:
+            shutil.rmtree(folder, ignore_errors=True)  # killed before its first checkpoint: begins again
+        read, write = os.pipe()
+        self.log = log or Path(f"{folder}.log")
+        self._status: int | None = None
+        self.born = time.monotonic()
+        self.pid = os.fork()
+        if self.pid == 0:
+            os.close(read)
+            _train([str(a) for a in (*OPTIONS, *resume)], self.log, write, prepare)
+        os.close(write)
+        self._beats = read
+
+    def wait(self) -> int:
+        """Exit status; minus the signal's number for a process that was killed."""
+        if self._status is None:
+            self._status = os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
+        return self._status
+
+    def alive(self) -> bool:
+        """Whether the process still runs; it is not reaped."""
+        return os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None
+
+    def finished_iterations(self) -> int:
+        """Iterations finished in all, once the process is gone."""
+        count = 0
+        while part := os.read(self._beats, 4096):
+            count += len(part)
+        os.close(self._beats)
+        return self.start + count
+
+
+def _train(args: list[str], log: Path, beats: int, prepare: Prepare | None) -> None:
+    """In the child: train, with a byte into `beats` for every iteration finished, and never return."""
+    status = 70
+    try:
+        handle = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
+        os.dup2(handle, 1)
+        os.dup2(handle, 2)
+        update = DualPPO.update
+
+        def counted(alg: DualPPO) -> dict[str, float]:
+            result = update(alg)
+            os.write(beats, b".")
+            return result
+
+        DualPPO.update = counted
+        if prepare:
+            prepare()
+        status = train.main(args)
+    except Exception:
+        traceback.print_exc()
+    finally:
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(OSError):
+                stream.flush()
+        os._exit(status)
+
+
+def newest(folder: Path) -> Path | None:
+    """The newest checkpoint of a run, if it has one."""
+    return max(folder.glob(CHECKPOINT_PATTERN), default=None)
+
+
+def newest_iteration(folder: Path) -> int:
+    """How far a run can be gone on from."""
+    path = newest(folder)
+    return load_checkpoint(path)["iteration"] if path else 0
+
+
+def equal(a: Any, b: Any) -> bool:
+    """Whether nested data are equal, tensors bit for bit."""
+    if isinstance(a, dict):
+        return isinstance(b, dict) and a.keys() == b.keys() and all(equal(a[k], b[k]) for k in a)
+    if isinstance(a, list):
+        return isinstance(b, list) and len(a) == len(b) and all(map(equal, a, b))
+    return torch.equal(a, b) if isinstance(a, torch.Tensor) else bool(a == b)
+
+
+def same_end(folder: Path, reference: Path) -> bool:
+    """Whether a run ended as the one that nothing happened to: networks, optimisers, worlds, random numbers."""
+    parts = ("model", "learner", "env", "iteration", "samples", "rng")
+    one, other = (load_checkpoint(f / f"checkpoint_{ITERATIONS:06d}.pt") for f in (folder, reference))
+    return all(equal(one[p], other[p]) for p in parts)
+
+
+def curve(folder: Path, tag: str) -> list[tuple[int, float]]:
+    """(samples, value) of a curve, as TensorBoard reads it."""
+    events = EventAccumulator(str(folder))
+    events.Reload()
+    return [(e.step, e.value) for e in events.Scalars(tag)]
+
+
+def one_curve(folder: Path) -> bool:
+    """Whether the log has every iteration once, in order."""
+    steps = [step for step, _ in curve(folder, "throughput/steps_per_s")]
+    return steps == [STEPS * WORLDS * (i + 1) for i in range(ITERATIONS)]
+
+
+def kill_runs(work: Path, reference: Path, kills: int, pace: tuple[float, float], rng: random.Random) -> list[Row]:
+    """Kill trainings `kills` times, a third of them during a save, and go on with each from what is left."""
+    kinds = anywhere, saving, renaming = ("at any moment", "during a save", "before a rename")
+    rows = {kind: Row(f"SIGKILL {kind}", 0, 0, 0, "") for kind in kinds}
+    torn, ends, folder = 0, 0, work / "killed0"
+    while sum(r.injected for r in rows.values()) < kills:
+        kind = rng.choice([anywhere] * 4 + [saving, renaming])
+        run = Run(folder, _killed_at_rename(folder, rng.randint(1, 5)) if kind == renaming else None)
+        if kind == anywhere:
+            _kill_after(run, rng.uniform(0.0, pace[0] + 5.0 * pace[1]))
+        elif kind == saving:
+            _kill_while_saving(run, rng)
+        if run.wait() == -signal.SIGKILL:
+            row = rows[kind]
+            row.injected += 1
+            torn += any(folder.glob(".checkpoint_*"))
+            for path in folder.glob(CHECKPOINT_PATTERN):
+                load_checkpoint(path)  # raises if it is not whole
+            lost = run.finished_iterations() - newest_iteration(folder)
+            row.most_lost = max(row.most_lost or 0, lost)
+            row.survived += lost <= INTERVAL
+        else:
+            _require_good_end(run, reference)
+            ends += 1
+            folder = work / f"killed{ends}"
+    _require_good_end(Run(folder), reference)
+    ends += 1
+    rows[saving].outcome = f"{torn} of all kills left an unfinished file, none under a checkpoint's name"
+    rows[
+        anywhere
+    ].outcome = f"{ends} runs gone on with to their end, bit for bit the undisturbed one; logs without gaps"
+    return list(rows.values())
+
+
+def _ends(folder: Path, reference: Path) -> dict[str, bool]:
+    """What must hold of a run that was disturbed, once it has been gone on with to its end."""
+    same, gapless = same_end(folder, reference), one_curve(folder)
+    return {"bit for bit": same, "log without gaps": gapless, "nothing left over": not list(folder.glob(".*"))}
+
+
+def _require_good_end(run: Run, reference: Path) -> None:
+    if run.wait() or not _good_end(run.folder, reference):
+        shown = f"{_ends(run.folder, reference)}\n{run.log.read_text()}"
+        raise SystemExit(f"a run that was killed and gone on with did not end as it should: {shown}")
+
+
+def _good_end(folder: Path, reference: Path) -> bool:
+    return all(_ends(folder, reference).values())
+
+
+def _kill_after(run: Run, seconds: float) -> None:
+    end = time.monotonic() + seconds
+    while time.monotonic() < end and run.alive():
+        time.sleep(1e-3)
+    os.kill(run.pid, signal.SIGKILL)
+
+
+def _kill_while_saving(run: Run, rng: random.Random) -> None:
+    """Kill as soon as an unfinished checkpoint shows, or a few milliseconds later."""
+    while run.alive() and not any(run.folder.glob(".checkpoint_*")):
+        time.sleep(2e-4)
+    time.sleep(rng.uniform(0.0, 4e-3))
+    os.kill(run.pid, signal.SIGKILL)
+
+
+def _killed_at_rename(folder: Path, number: int) -> Prepare:
+    """Ends the process just before it renames a finished file of the run for the `number`-th time."""
+    count = 0
+
+    def hook(event: str, args: tuple[Any, ...]) -> None:
+        nonlocal count
+        if event == "os.rename" and str(folder) in str(args[1]):
+            count += 1
+            if count == number:
+                os.kill(os.getpid(), signal.SIGKILL)
+
+    return lambda: sys.addaudithook(hook)
+
+
+def at_step(number: int, act: Callable[[H1Env], None], before: bool = True) -> Prepare:
+    """Do something to the environment at one of its steps, before or after it."""
+
+    def prepare() -> None:
+        step, count = H1Env.step, 0
+
+        def hurt(env: H1Env, actions: torch.Tensor) -> Any:
+            nonlocal count
+            count += 1
+            if count == number and before:
+                act(env)
+            result = step(env, actions)
+            if count == number and not before:
+                act(env)
+            return result
+
+        H1Env.step = hurt
+
+    return prepare
+
+
+def diverge(work: Path) -> list[Row]:
+    """A position that is not a number, and a force beyond all measure, in one world."""
+
+    def nan(env: H1Env) -> None:
+        env.sim.qpos[SICK, 10] = math.nan
+
+    def push() -> None:
+        forces, count = H1Env._apply_forces, 0
+
+        def pushed(env: H1Env) -> None:
+            nonlocal count
+            forces(env)
+            count += 1
+            if count == 9:
+                env.sim.xfrc[SICK, 1, 2] = 1e12
+
+        H1Env._apply_forces = pushed
+
+    rows = []
+    for name, prepare in (("NaN in a world's state", at_step(9, nan)), ("force of 1e12 N on a world", push)):
+        folder = work / f"diverged{len(rows)}"
+        run = Run(folder, prepare)
+        ok = run.wait() == 0 and "worlds diverged 1 times" in run.log.read_text()
+        ok = ok and curve(folder, "episode/diverged")[-1][1] == 1.0 and _all_finite(load_checkpoint(newest(folder)))
+        rows.append(Row(name, 1, int(ok), 0, "the world's episode ends, named and counted once; all else finite"))
+    return rows
+
+
+def bad_reward(work: Path) -> Row:
+    """A reward that is not a number."""
+
+    def prepare() -> None:
+        reward, count = H1Env._reward, 0
+
+        def spoiled(env: H1Env, *args: Any) -> Any:
+            nonlocal count
+            rewards, log = reward(env, *args)
+            count += 1
+            if count == 9:
+                rewards[SICK, 0] = math.nan
+            return rewards, log
+
+        H1Env._reward = spoiled
+
+    run = Run(work / "reward", prepare)
+    ok = run.wait() == 0 and "steps of agent 'lower' skipped" in run.log.read_text()
+    ok = ok and sum(v for _, v in curve(run.folder, "agents/lower/skipped")) > 0.0
+    ok = ok and _all_finite(load_checkpoint(newest(run.folder))["model"])
+    return Row("NaN in a reward", 1, int(ok), 0, "one agent's steps of one iteration skipped, named and counted")
+
+
+def _all_finite(value: Any) -> bool:
+    if isinstance(value, dict):
+        return all(_all_finite(v) for v in value.values())
+    return bool(torch.isfinite(value).all()) if isinstance(value, torch.Tensor) else True
+
+
+def raising_step(work: Path, reference: Path) -> Row:
+    """A step that raises, as when a worker dies."""
+
+    def fail(_env: H1Env) -> None:
+        raise RuntimeError("planted: a worker died")
+
+    folder = work / "raised"
+    run = Run(folder, at_step(5 * STEPS + 2, fail))
+    said = f"iteration 6 failed (RuntimeError: planted: a worker died); go on with --resume {folder}"
+    ok = run.wait() == 1 and said in run.log.read_text()
+    lost = run.finished_iterations() - newest_iteration(folder)
+    ok = ok and lost <= INTERVAL and Run(folder).wait() == 0 and _good_end(folder, reference)
+    return Row("a step that raises", 1, int(ok), lost, "run stops, says why and how to go on; ends bit for bit equal")
+
+
+def clock_jumps(work: Path, reference: Path) -> list[Row]:
+    """The clock is a day ahead, then a day behind, within a run and between its two halves."""
+    rows = []
+    for name, first, second in (("forward", 0.0, 86400.0), ("back", 86400.0, -86400.0)):
+        folder = work / f"clock-{name}"
+        stop = at_step(6 * STEPS, lambda _env: os.kill(os.getpid(), signal.SIGTERM))
+        ok = Run(folder, _both(_clock(first, -first), stop)).wait() == 0
+        ok = ok and Run(folder, _clock(second, -second)).wait() == 0 and _good_end(folder, reference)
+        rows.append(Row(f"clock jumps {name} by a day", 2, 2 * ok, 0, "ends bit for bit equal; one curve in the log"))
+    return rows
+
+
+def _both(one: Prepare, other: Prepare) -> Prepare:
+    return lambda: (one(), other(), None)[2]
+
+
+def _clock(early: float, late: float) -> Prepare:
+    """A clock that is off by `early` seconds, and after a few hundred readings by `late`."""
+
+    def prepare() -> None:
+        now, readings = time.time, 0
+
+        def wrong() -> float:
+            nonlocal readings
+            readings += 1
+            return now() + (early if readings < 5 else late)
+
+        time.time = wrong
+
+    return prepare
+
+
+def full_disk(work: Path, reference: Path) -> list[Row]:
+    """A file system that fills up, for a while and for good, and one that is read-only from the start."""
+    disk = work / "disk"
+    disk.mkdir()
+    try:
+        _mount("-t", "tmpfs", "-o", "size=12M", "tmpfs", disk)
+    except (OSError, subprocess.CalledProcessError) as error:
+        return [Row("full disk", 0, 0, None, f"not injected: file systems cannot be mounted here ({error})")]
+    ballast = disk / "ballast"
+
+    def fill(_env: H1Env) -> None:
+        with contextlib.suppress(OSError), ballast.open("wb", buffering=0) as file:
+            while True:
+                file.write(bytes(4096))
+
+    def free(_env: H1Env) -> None:
+        ballast.unlink()
+
+    folder = disk / "while"
+    run = Run(folder, _both(at_step(3 * STEPS, fill), at_step(9 * STEPS, free)))  # its output goes to the full disk too
+    done = run.wait() == 0
+    failed = int(curve(folder, "faults/failed_saves")[-1][1])
+    ok = done and failed > 0 and same_end(folder, reference)
+    rows = [Row("disk full for six iterations", 1, int(ok), 0, f"{failed} saves failed; ends bit for bit equal")]
+
+    folder = disk / "for-good"
+    shutil.rmtree(disk / "while")
+    run = Run(folder, at_step(3 * STEPS, fill), work / "for-good.log")
+    status = run.wait()
+    done = run.finished_iterations()
+    kept = newest_iteration(folder)
+    ballast.unlink()
+    ok = (
+        "trying again after the next iteration" in run.log.read_text()
+        and status == 2
+        and kept == INTERVAL
+        and Run(folder).wait() == 0
+        and same_end(folder, reference)
+    )
+    outcome = "trains on, tries to save after every iteration, ends with an error; last checkpoint whole"
+    rows.append(Row("disk full for good", 1, int(ok), done - kept, outcome))
+
+    shutil.rmtree(folder)
+    _mount("-o", "remount,ro", disk)
+    run = Run(disk / "never", log=work / "never.log")
+    ok = run.wait() == 2 and "Read-only file system" in run.log.read_text() and not (disk / "never").exists()
+    rows.append(Row("read-only file system", 1, int(ok), 0, "refused before anything is done"))
+    return rows
+
+
+def _mount(*args: Any) -> None:
+    subprocess.run(["mount", *map(str, args)], check=True, capture_output=True)
+
+
+def own_mounts() -> None:
+    """Give this process mounts of its own, which end with it. Raises OSError where the system does not allow it."""
+    user, group = os.getuid(), os.getgid()
+    new_mounts, new_user = 0x00020000, 0x10000000
+    if ctypes.CDLL(None, use_errno=True).unshare(new_mounts | (new_user if user else 0)):
+        raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+    if user:
+        Path("/proc/self/setgroups").write_text("deny")
+        Path("/proc/self/uid_map").write_text(f"0 {user} 1")
+        Path("/proc/self/gid_map").write_text(f"0 {group} 1")
+    _mount("--make-rprivate", "/")
+
+
+def obey_permissions() -> None:
+    """Make this process heed file permissions even if it is root's: give up CAP_DAC_OVERRIDE (Linux)."""
+    if os.getuid() == 0:
+        libc, version = ctypes.CDLL(None, use_errno=True), 0x20080522
+        header, sets = (ctypes.c_uint32 * 2)(version, 0), (ctypes.c_uint32 * 6)()
+        libc.capget(header, sets)
+        sets[0] &= ~(1 << 1)
+        if libc.capset(header, sets):
+            raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+
+
+def locked_folder(work: Path, reference: Path) -> Row:
+    """The run's folder loses its write permission for a while."""
+    folder = work / "locked"
+    lock = at_step(3 * STEPS, lambda _env: folder.chmod(0o555))
+    unlock = at_step(9 * STEPS, lambda _env: folder.chmod(0o777))
+    run = Run(folder, _both(obey_permissions, _both(lock, unlock)))
+    ok = run.wait() == 0 and "Permission denied" in run.log.read_text() and _good_end(folder, reference)
+    failed = int(curve(folder, "faults/failed_saves")[-1][1])
+    return Row("folder read-only for six iterations", 1, int(ok), 0, f"{failed} saves failed; ends bit for bit equal")
+
+
+def undisturbed(work: Path) -> tuple[Path, tuple[float, float]]:
+    """A run that nothing happens to, and its pace: seconds to the end of the first iteration, and per iteration."""
+    run = Run(work / "reference")
+    os.read(run._beats, 1)
+    first = time.monotonic() - run.born
+    if run.wait():
+        raise SystemExit(run.log.read_text())
+    return run.folder, (first, (time.monotonic() - run.born - first) / (ITERATIONS - 1))
+
+
+def inject(kills: int, work: Path, seed: int) -> list[Row]:
+    """Every fault, one after the other."""
+    torch.set_num_threads(1)
+    with contextlib.suppress(OSError, subprocess.CalledProcessError, AttributeError):
+        own_mounts()
+    reference, pace = undisturbed(work)
+    rows = kill_runs(work, reference, kills, pace, random.Random(seed))
+    rows += [*diverge(work), bad_reward(work), raising_step(work, reference), *clock_jumps(work, reference)]
+    return [*rows, locked_folder(work, reference), *full_disk(work, reference)]
+
+
+def table(rows: list[Row]) -> str:
+    """As Markdown."""
+    lines = ["| fault | injected | survived | most lost [iterations] | outcome |", "|---|---|---|---|---|"]
+    for r in rows:
+        lost = "-" if r.most_lost is None else r.most_lost
+        lines.append(f"| {r.fault} | {r.injected} | {r.survived} | {lost} | {r.outcome} |")
+    return "\n".join(lines)
+
+
+def main() -> int:
+    """Returns the exit status: 0 if every fault was survived, else 1."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--kills", type=int, default=50, help="how often to kill a training")
+    parser.add_argument("--seed", type=int, default=0, help="of the moments at which it is killed")
+    parser.add_argument("--json", type=Path, help="write the table here")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="cotap-faults-") as work:
+        rows = inject(options.kills, Path(work), options.seed)
+    print(f"{WORLDS} worlds, {ITERATIONS} iterations, a save every {INTERVAL}\n\n{table(rows)}")
+    if options.json:
+        options.json.write_text(json.dumps([asdict(r) for r in rows], indent=2) + "\n")
+    return int(any(r.survived < r.injected for r in rows))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,285 @@
+"""Hostile input: whatever a file or a command line holds, it is used or refused with a clear error."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import os
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+
+from cotap import evaluate, train
+from cotap.agents.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
+from cotap.agents.runner import DualRunner
+from cotap.compliance.laws import LawConfig
+from cotap.configs import BASE_RECIPES, BaseTraining, from_plain, to_plain
+from cotap.envs import H1Env
+from cotap.evaluation.law_options import parse_law
+from cotap.evaluation.policy import load_policy
+from cotap.motions.formats import FORMATS
+from cotap.motions.joblib_files import load_joblib
+from cotap.motions.library import MotionError, MotionLibrary, shipped_library
+from cotap.robots import RobotSpec
+
+EXAMPLES = int(os.environ.get("COTAP_FUZZ_EXAMPLES", "0"))
+"""How many inputs each property is tried on; 0 for a few that are always the same."""
+# No shrinking: what is drawn is small as it is, and a failure should not take minutes to be told.
+few = settings(
+    max_examples=EXAMPLES or 15,
+    derandomize=not EXAMPLES,
+    deadline=None,
+    database=None,
+    phases=(Phase.explicit, Phase.generate),
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+scalars = st.one_of(
+    st.none(), st.booleans(), st.integers(), st.integers(-3, 3), st.floats(), st.text(max_size=8), st.binary(max_size=8)
+)
+plain = st.recursive(
+    scalars,
+    lambda v: st.lists(v, max_size=3) | st.dictionaries(st.text(max_size=4) | st.integers(), v, max_size=3),
+    max_leaves=4,
+)
+tensors = st.builds(
+    lambda shape, dtype: torch.zeros(shape, dtype=dtype),
+    st.lists(st.integers(0, 3), max_size=3),
+    st.sampled_from([torch.float32, torch.float64, torch.int64, torch.bool, torch.uint8]),
+)
+
+
+def paths(value: Any, at: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """Every place in nested dicts and lists but the whole."""
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    return [p for key, v in items for p in [(*at, key), *paths(v, (*at, key))]]
+
+
+def damage(content: dict[str, Any], draw: st.DataObject, values: st.SearchStrategy[Any]) -> dict[str, Any]:
+    """A copy in which one or two places are gone or hold something else."""
+    content = copy.deepcopy(content)
+    for _ in range(draw.draw(st.integers(1, 2))):
+        *way, last = draw.draw(st.sampled_from(paths(content)))
+        place: Any = content
+        for key in way:
+            place = place[key]
+        if draw.draw(st.booleans()):
+            place[last] = draw.draw(values)
+        else:
+            del place[last]
+    return content
+
+
+def changed_bytes(data: bytes, draw: st.DataObject) -> bytes:
+    """A copy with a few bytes changed, cut off or put in."""
+    out = bytearray(data)
+    for at in draw.draw(st.lists(st.integers(0, len(out) - 1), min_size=1, max_size=6)):
+        out[at % len(out)] = draw.draw(st.integers(0, 255))
+    at = draw.draw(st.integers(0, len(out)))
+    way = draw.draw(st.sampled_from(["keep", "cut", "insert"]))
+    if way == "cut":
+        del out[max(at, 1) :]
+    if way == "insert":
+        out[at:at] = draw.draw(st.binary(max_size=20))
+    return bytes(out)
+
+
+@dataclass(repr=False)
+class Trained:
+    """The content of a tiny run's checkpoint, a runner that could go on from it, and a folder."""
+
+    content: dict[str, Any]
+    runner: DualRunner
+    folder: Path
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
+    folder = tmp_path_factory.mktemp("hostile")
+    options = ["--num-envs", "2", "--iterations", "1", "--threads", "1", "--ppo.hidden", "4", "4", "--ppo.steps", "4"]
+    assert train.main(["base", *options, "--ppo.precision", "fp32", "--run-dir", str(folder / "run")]) == 0
+    content = load_checkpoint(folder / "run" / "checkpoint_000001.pt")
+    training = from_plain(BaseTraining, content["config"]["training"])
+    env = H1Env(training.env)
+    return Trained(content, DualRunner(env, training.runner, training.ppo, folder, content["config"]), folder)
+
+
+@few
+@given(draw=st.data())
+def test_a_checkpoint_with_changed_bytes_is_whole_or_refused(trained: Trained, draw: st.DataObject):
+    runner, folder = trained.runner, trained.folder
+    path = folder / "bytes.pt"
+    path.write_bytes(changed_bytes((folder / "run" / "checkpoint_000001.pt").read_bytes(), draw))
+    try:
+        runner.load(str(path))
+    except CheckpointError as error:
+        assert str(path) in str(error)  # noqa: PT017
+
+
+@few
+@given(draw=st.data())
+def test_a_checkpoint_with_changed_parts_is_whole_or_refused(trained: Trained, draw: st.DataObject):
+    content, runner, folder = trained.content, trained.runner, trained.folder
+    path = folder / "parts.pt"
+    save_checkpoint(path, damage(content, draw, plain | tensors))
+    uses = (runner.load, load_policy, partial(train._config_of, kind=BaseTraining))
+    for use in uses:
+        try:
+            use(str(path))
+        except CheckpointError as error:
+            assert "parts.pt" in str(error)  # noqa: PT017  whether it is raised depends on what was drawn
+
+
+STATES = [
+    ("env", "parts", "upper_body", "parameters", "alpha"),
+    ("env", "parts", "commands", "_stand"),
+    ("env", "delay", "delay_s"),
+    ("env", "last_action"),
+    ("env", "observations", "policy"),
+    ("learner", "optimizers", "lower", "state", 0, "exp_avg"),
+]
+
+
+@pytest.mark.parametrize("way", STATES, ids=lambda way: str(way[-1]))
+def test_a_state_of_another_size_is_refused(trained: Trained, way: tuple[Any, ...]):
+    content, runner, folder = trained.content, trained.runner, trained.folder
+    content = copy.deepcopy(content)
+    *to, last = way
+    place = content
+    for key in to:
+        place = place[key]
+    place[last] = torch.zeros(7, dtype=torch.float32)
+    save_checkpoint(folder / "size.pt", content)
+    with pytest.raises(CheckpointError, match=r"states that do not fit this run: .*(shape|size|tensor)"):
+        runner.load(str(folder / "size.pt"))
+
+
+@few
+@given(draw=st.data())
+def test_a_config_with_changed_values_is_valid_or_refused(draw: st.DataObject):
+    data = damage(to_plain(BASE_RECIPES["default"]()), draw, plain)
+    try:
+        config = from_plain(BaseTraining, data)
+        config.env.check()
+        config.ppo.check()
+        config.runner.check()
+    except ValueError as error:
+        assert str(error)  # noqa: PT017
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        ({"env": 3}, "env must be a table of fields, got int 3"),
+        ({"seed": "0"}, "seed must be of type int, got str '0'"),
+        ({"seed": True}, "seed must be of type int, got bool True"),
+        ({"ppo": {"hidden": "ab"}}, r"ppo.hidden must be a list, got str 'ab'"),
+        ({"ppo": {"hidden": [8, None]}}, r"ppo.hidden\[1\] must be of type int, got NoneType None"),
+        ({"env": {"commands": {"velocity_x": [1.0]}}}, "env.commands.velocity_x must have 2 entries, got 1"),
+        ({"env": {"assist": {"enabled": 1}}}, "env.assist.enabled must be of type bool, got int 1"),
+        ({3: 1}, "BaseTraining has no field '3'"),
+    ],
+)
+def test_a_value_of_another_type_is_named(data: Any, message: str):
+    with pytest.raises(ValueError, match=message):
+        from_plain(BaseTraining, data)
+
+
+@few
+@given(st.text(max_size=30) | st.builds("cotap:{}={}".format, st.text(max_size=9), st.text(max_size=9)))
+def test_a_law_from_the_command_line_is_one_or_refused(text: str):
+    try:
+        parse_law("left", text, LawConfig()).check()
+    except ValueError as error:
+        assert str(error)  # noqa: PT017
+
+
+words = st.sampled_from(
+    ["base", "distill", "--resume", "--run-dir", "--num-envs", "--iterations", "--recipe", "--seed", "--threads",
+     "--device", "--ppo.hidden", "--ppo.gamma", "--env.commands.velocity-x", "velocity-tracking", "impact", "--left",
+     "--stiffness", "--force", "--checkpoint", "--hand", "--json", "paper", "cuda", "0", "-1", "1e400", "nan", "--"]
+)  # fmt: skip
+
+
+@few
+@given(args=st.lists(words | st.text(max_size=6), max_size=6))
+def test_a_command_line_is_obeyed_or_refused(
+    args: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], in_tmp_path: None
+):
+    """Up to where work would begin."""
+    del in_tmp_path
+    monkeypatch.setattr(train, "_train", lambda _stage, options, _base: options.training.check())
+    monkeypatch.setattr(train, "train_both", lambda options: options.check())
+
+    def prepare(options: Any) -> None:
+        options.protocol.check()
+        options.laws.configure()
+
+    monkeypatch.setattr(evaluate, "PROTOCOLS", {k: (kind, prepare) for k, (kind, _) in evaluate.PROTOCOLS.items()})
+    for main in (train.main, evaluate.main):
+        try:
+            status = main(list(args))
+        except SystemExit as stop:  # the parser's way
+            status = int(stop.code or 0)
+        said = capsys.readouterr()
+        assert status in (0, 2), said.err
+        assert status == 0 or said.err or said.out
+
+
+def motion_files(spec: RobotSpec, folder: Path) -> dict[str, Path]:
+    """A good file of every format that is text or numpy's."""
+    rows = np.zeros((4, 44))
+    rows[:, 0] = 0.03
+    rows[:, [4, 8, 12, 16, 21, 25, 30, 35, 39]] = 1.0
+    out = {name: folder / f"good.{suffix}" for name, suffix in (("deepmimic", "txt"), ("lafan", "csv"))}
+    out["deepmimic"].write_text(json.dumps({"Frames": rows.tolist()}))
+    table = np.zeros((4, 7 + len(spec.arms)))
+    table[:, 6] = 1.0
+    out["lafan"].write_text("\n".join(",".join(map(str, r)) for r in table))
+    out["amass"] = folder / "amass.npz"
+    np.savez(out["amass"], poses=np.zeros((4, 66)), trans=np.zeros((4, 3)), mocap_framerate=30.0)
+    out["npz"] = folder / "library.npz"
+    MotionLibrary(shipped_library(spec).clips[:1], spec).save(out["npz"])
+    return out
+
+
+@pytest.mark.parametrize("form", ["deepmimic", "lafan", "amass", "npz"])
+@few
+@given(draw=st.data())
+def test_a_motion_file_with_changed_bytes_is_read_or_refused(
+    form: str, spec: RobotSpec, tmp_path: Path, draw: st.DataObject
+):
+    good = motion_files(spec, tmp_path)[form]
+    path = tmp_path / f"changed{good.suffix}"
+    path.write_bytes(changed_bytes(good.read_bytes(), draw))
+    try:
+        clips = [read() for _, read in FORMATS[form](path, spec)]
+    except MotionError as error:
+        assert str(error)  # noqa: PT017
+    else:
+        assert all(np.isfinite(c.arms).all() for c in clips)
+
+
+@few
+@given(st.binary(max_size=200))
+def test_bytes_that_are_no_motion_are_refused(tmp_path: Path, data: bytes):
+    path = tmp_path / "x.pkl"
+    path.write_bytes(b"\x80\x04" + data)
+    try:
+        load_joblib(path)
+    except MotionError as error:
+        assert str(path) in str(error)  # noqa: PT017
+
+
+def test_numbers_beyond_floats_in_a_config_are_refused():
+    data = to_plain(BASE_RECIPES["default"]())
+    data["env"]["control_dt"] = math.inf
+    with pytest.raises(ValueError, match="control_dt must be a finite number"):
+        from_plain(BaseTraining, data).env.check()
