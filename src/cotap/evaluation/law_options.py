@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 from cotap.checks import require_one_of, require_range
 from cotap.compliance.laws import LAWS, LawConfig
@@ -42,8 +43,9 @@ class LawOptions:
 
     def configure(self) -> UpperBodyConfig:
         """The config of the arms. Raises ValueError naming what is wrong."""
-        own = {f.name: getattr(self, f.name) for f in fields(LawConfig) if hasattr(self, f.name)}
-        common = LawConfig(self.method, **(own | {"stiffness": _three(self.stiffness)}))
+        own: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(LawConfig) if hasattr(self, f.name)}
+        own["stiffness"] = _three(self.stiffness)
+        common = LawConfig(self.method, **own)
         out = UpperBodyConfig(
             parse_law("left", self.left, common) if self.left else common,
             parse_law("right", self.right, common) if self.right else replace(common),
