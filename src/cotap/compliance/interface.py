@@ -50,8 +50,8 @@ class Arms:
         """The same arms in another precision."""
         i = self.inertias
         links = LinkInertias(i.mass.to(dtype), i.com.to(dtype), i.inertia.to(dtype), i.armature)
-        limits = (x.to(dtype) for x in (self.kp, self.kd, self.low, self.high, self.speed))
-        return Arms(self.chains.to(dtype), links, *limits, self.friction)
+        kp, kd, low, high, speed = (x.to(dtype) for x in (self.kp, self.kd, self.low, self.high, self.speed))
+        return Arms(self.chains.to(dtype), links, kp, kd, low, high, speed, self.friction)
 
 
 @dataclass(frozen=True)
