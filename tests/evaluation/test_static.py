@@ -123,6 +123,15 @@ def test_arms_have_laws_of_their_own():
     assert (cfg.left.name, cfg.left.alpha, cfg.left.stiffness) == ("cotap", 0.5, (1.0, 2.0, 3.0))
     assert (cfg.right.name, cfg.right.alpha) == ("pd", 0.9)
     assert parse_law("left", "soft-pd:soft-gain=20", cfg.left).soft_gain == 20.0
+    facet = parse_law("left", "facet:sensing=estimated,virtual-mass=2", cfg.left)
+    assert (facet.name, facet.sensing, facet.virtual_mass, facet.stiffness) == (
+        "facet",
+        "estimated",
+        2.0,
+        (1.0, 2.0, 3.0),
+    )
+    shared = LawOptions("cotap+facet-matched", damping_ratio=0.5, reference_share=0.3, error="task").configure().right
+    assert (shared.damping_ratio, shared.reference_share, shared.error) == (0.5, 0.3, "task")
 
 
 @pytest.mark.parametrize(
