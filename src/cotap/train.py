@@ -81,7 +81,7 @@ class PipelineOptions:
     """Number of worlds."""
     base_iterations: int = 1225
     """Iterations of stage 1 from nothing to walking."""
-    robust_iterations: int = 1375
+    robust_iterations: int = 860
     """Iterations of stage 1 after that, with blows and loads on the hands."""
     distill_iterations: int = 900
     """Iterations of stage 2."""

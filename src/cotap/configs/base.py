@@ -72,7 +72,7 @@ def robust(training: BaseTraining | None = None) -> BaseTraining:
     env.rewards.lower.track_mean_velocity = 3.0
     env.rewards.lower.track_mean_yaw_rate = 1.2
     training.ppo.least_std = 0.12
-    training.runner.iterations = 2600
+    training.runner.iterations = 2085
     return training
 
 
