@@ -397,6 +397,16 @@ def test_a_resumed_distillation_ends_where_a_straight_one_does(checkpoint: Path,
         assert torch.equal(value, newest(first)["model"][key]), key
 
 
+def test_a_shipped_distilled_policy_goes_on_under_the_base_it_is_given(checkpoint: Path, tmp_path: Path):
+    distill(tmp_path / "run", checkpoint)
+    shipped = tmp_path / "cotap.pt"
+    save_checkpoint(shipped, newest(tmp_path / "run") | {"learner": {}, "env": {}})
+    more = [ITERATIONS, 3, RUN_DIR, tmp_path / "more"]
+    assert run("distill", RESUME, shipped, BASE_CHECKPOINT, checkpoint, *more) == 0
+    for key, value in load_checkpoint(checkpoint)["model"].items():
+        assert torch.equal(newest(tmp_path / "more")["learner"]["guide"][key], value), key
+
+
 def test_the_papers_range_is_a_recipe(checkpoint: Path, tmp_path: Path):
     content = distill(tmp_path / "run", checkpoint, RECIPE, "paper")
     assert content["config"]["training"]["env"]["upper_body"]["sampling"]["stiffness"] == [150.0, 450.0]

@@ -169,13 +169,21 @@ def _parse_distill(args: list[str]) -> DistillOptions:
     args = _expand(args)
     recipe = require_one_of("recipe", _peek(args, "--recipe") or "default", DISTILL_RECIPES.keys())
     resumed, base = _peek(args, "--resume"), _peek(args, "--base-checkpoint")
+    if not base and not (resumed and _brings_guide(resumed)):
+        base = str(shipped_checkpoint("base"))
     if resumed:
         training = _config_of(resumed, DistillTraining)
     else:
-        base = base or str(shipped_checkpoint("base"))
         training = DISTILL_RECIPES[recipe](_config_of(base, BaseTraining))
     default = DistillOptions(recipe=recipe, base_checkpoint=base, training=training)
     return tyro.cli(DistillOptions, args=args, default=default, prog="python -m cotap.train distill")
+
+
+def _brings_guide(checkpoint: str) -> bool:
+    """Whether a distillation's checkpoint has the base that guides it; a shipped one has not."""
+    from cotap.agents.checkpoint import load_checkpoint
+
+    return bool(load_checkpoint(checkpoint).get("learner"))
 
 
 def _config_of(checkpoint: str, kind: type[Any]) -> Any:
@@ -211,7 +219,7 @@ def train_distill(options: DistillOptions) -> Path:
     from cotap.agents.checkpoint import CheckpointError, load_checkpoint, require_parts
 
     base = None
-    if not options.resume:
+    if options.base_checkpoint:
         base = load_checkpoint(options.base_checkpoint)
         require_parts(options.base_checkpoint, base, ("kind", "layout", "model"))
         if base["kind"] != "base":

@@ -35,7 +35,7 @@ def batched(
     policy = load_policy(shipped_checkpoint("base"))
     cfg = from_plain(H1EnvConfig, policy.config["training"]["env"])
     cfg.num_envs, cfg.num_threads, cfg.fixed_base, cfg.upper_body = 1, 1, True, laws
-    cfg.assist.enabled = cfg.hand_forces.enabled = cfg.randomization.enabled = False
+    cfg.assist.enabled = cfg.hand_forces.enabled = cfg.blows.enabled = cfg.randomization.enabled = False
     cfg.motions.clips.only, cfg.motions.clips.share = ("punch",), 1.0
     cfg.force.force, cfg.force.hand, cfg.force.start_s = (8.0, -5.0, -6.0), "both", 0.5
     env = H1Env(cfg)
@@ -75,7 +75,7 @@ def test_the_loop_is_the_batched_environment(law, stand, seconds, policy, spec):
     robot.engine.hold(True)
     moved = 0.0
     for k, (joints, torque) in enumerate(zip(expected, torques, strict=True)):
-        push = env.scripted.at(torch.tensor([k * env.dt]))[0].double().numpy()
+        push = env.scripted.at(torch.tensor([k * env.dt]))[0, :-1].double().numpy()
         robot.act(controller.step(robot.read()), push)
         np.testing.assert_allclose(robot.engine.qpos[7:], joints, atol=1e-4, err_msg=f"step {k}")
         np.testing.assert_allclose(robot.torque(), torque, atol=0.05, err_msg=f"step {k}")

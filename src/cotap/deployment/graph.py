@@ -117,7 +117,8 @@ def describe(
 ) -> PolicyMetadata:  # fmt: skip
     """The metadata of a policy that was trained in the environment `cfg`."""
     laws, joints = cfg.upper_body, spec.joints
-    sampling = {k: v for k, v in to_plain(laws.sampling).items() if k not in ("enabled", "hold_s")}
+    sampling = to_plain(laws.sampling)
+    ranges = {name: sampling[name] for name in ("stiffness", "null_stiffness", "alpha")}
     return PolicyMetadata(
         format=FORMAT,
         robot=spec.name,
@@ -139,7 +140,7 @@ def describe(
                      "frames": FRAMES},
         commands=asdict(cfg.commands),
         law={"left": to_plain(laws.left), "right": to_plain(laws.right),
-             "ranges": sampling if laws.sampling.enabled else None},
+             "ranges": ranges if laws.sampling.enabled else None},
         checkpoint_sha256=checkpoint_sha256,
         cotap_version=__version__,
         opset=OPSET,

@@ -1,0 +1,194 @@
+"""What distillation did: does the CoTaP policy walk as well as its base at every stiffness, does one policy obey the
+stiffness that it is asked for, and does it keep its feet while that changes. Writes docs/distillation.md."""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+STIFFNESS = (100, 300, 500, 800)
+ALPHA = (0.0, 0.3, 0.7, 1.0)
+WALKING = {
+    "e_lin_gait": "velocity error [m/s]",
+    "e_yaw_gait": "yaw-rate error [rad/s]",
+    "e_height": "height error [m]",
+    "foot_slip": "foot slip [m/s]",
+}
+
+
+@dataclass
+class Runs:
+    """Evaluations, kept by name."""
+
+    folder: Path
+    checkpoint: str
+    threads: int
+    reuse: bool
+
+    def __call__(self, name: str, *args: str, checkpoint: str = "") -> dict[str, Any]:
+        """The result of an evaluation; one that is there already where that is allowed."""
+        from cotap.evaluate import evaluate
+
+        path = self.folder / f"{name}.json"
+        if self.reuse and path.is_file():
+            return json.loads(path.read_text())
+        print(f"\n{name}", flush=True)
+        common = ["--checkpoint", checkpoint or self.checkpoint, "--threads", str(self.threads), "--json", str(path)]
+        return evaluate([args[0], *common, *args[1:]])
+
+
+def number(m: dict[str, Any], digits: int = 3) -> str:
+    """Mean and 95 % interval."""
+    if m["mean"] is None or m["ci95"] is None:
+        return str(m.get("reason", "-"))
+    return f"{m['mean']:.{digits}f} ({m['ci95'][0]:.{digits}f} to {m['ci95'][1]:.{digits}f})"
+
+
+def no_worse(mine: dict[str, Any], base: dict[str, Any]) -> bool:
+    """Within 10 % of the base's mean, or not beyond its 95 % interval."""
+    return mine["mean"] <= max(1.1 * base["mean"], base["ci95"][1])
+
+
+def walking(runs: Runs, envs: int, seconds: float) -> list[str]:
+    """The walk under every stiffness and blend, beside the base's."""
+    task = ["velocity-tracking", "--num-envs", str(envs), "--episode-seconds", str(seconds)]
+    base = runs("walking-base", *task, checkpoint="base")
+    lines = [
+        "## Walking", "",
+        f"Random commands, clips on the arms, randomisation on, {envs} worlds, {seconds:g} s. In bold: worse than the "
+        "base by more than 10 % and beyond its 95 % interval.", "",
+        "| K_ee [N/m] | alpha | " + " | ".join(WALKING.values()) + " | fell |",
+        "|---" * (3 + len(WALKING)) + "|",
+        "| base, PD | | " + " | ".join(number(base["metrics"][k]) for k in WALKING)
+        + f" | {base['num_falls']} of {envs} |",
+    ]  # fmt: skip
+    kept = total = 0
+    for stiffness in STIFFNESS:
+        for alpha in ALPHA:
+            law = ["--method", "cotap", "--stiffness", str(stiffness), "--alpha", str(alpha)]
+            result = runs(f"walking-{stiffness}-{alpha}", *task, *law)
+            cells = []
+            for key in WALKING:
+                mine, reference = result["metrics"][key], base["metrics"][key]
+                good = no_worse(mine, reference)
+                kept, total = kept + good, total + 1
+                cells.append(f"{mine['mean']:.3f}" if good else f"**{mine['mean']:.3f}**")
+            fell = result["metrics"]["fall_fraction"]
+            good = no_worse(fell, base["metrics"]["fall_fraction"])
+            kept, total = kept + good, total + 1
+            falls = f"{result['num_falls']} of {envs}"
+            cells.append(falls if good else f"**{falls}**")
+            lines.append(f"| {stiffness} | {alpha:g} | " + " | ".join(cells) + " |")
+    return [*lines, "", f"{kept} of {total} figures are no worse than the base's.", ""]
+
+
+def obedience(runs: Runs, envs: int) -> list[str]:
+    """One policy, no retraining: torque under an impact and displacement under a load, against stiffness."""
+    lines = [
+        "## One policy, every stiffness", "",
+        f"Left hand, stance, arms' default pose, {envs} worlds, alpha 1. Impact: 500 N x 0.05 s along x. "
+        "Load: -15 N in z, displacement of the hand relative to its reference.", "",
+        "| K_ee [N/m] | J_upper under the impact [Nm] | fell | displacement under the load [m] | F / K [m] | fell |",
+        "|---|---|---|---|---|---|",
+    ]  # fmt: skip
+    torques, drops = [], []
+    for stiffness in STIFFNESS:
+        law = ["--method", "cotap", "--stiffness", str(stiffness), "--num-envs", str(envs)]
+        blow = runs(f"impact-{stiffness}", "impact", *law)
+        load = runs(f"load-{stiffness}", "constant-load", "--force", "0", "0", "-15", *law)
+        torque, drop = blow["metrics"]["j_upper"], load["metrics"]["displacement_z"]
+        torques.append(torque)
+        drops.append(drop)
+        lines.append(
+            f"| {stiffness} | {number(torque, 1)} | {blow['num_falls']} of {envs} | {number(drop, 4)} "
+            f"| {-15.0 / stiffness:.4f} | {load['num_falls']} of {envs} |"
+        )
+    rising = all(a["ci95"][1] < b["ci95"][0] for a, b in itertools.pairwise(torques))
+    falling = all(a["ci95"][1] < b["ci95"][0] for a, b in itertools.pairwise(drops))
+    return [
+        *lines, "",
+        f"Torque rises with K_ee beyond the intervals: **{'yes' if rising else 'no'}**. "
+        f"Displacement falls with it beyond the intervals: **{'yes' if falling else 'no'}**.", "",
+    ]  # fmt: skip
+
+
+def against_pd(runs: Runs, envs: int) -> list[str]:
+    """The same policy under an impact, arms under PD and under CoTaP."""
+    lines = [
+        "## Against PD", "",
+        f"Impact of 500 N x 0.05 s on the left hand, the same policy and {envs} worlds, arms' default pose.", "",
+        "| mode | arms | e_torso [m/s] | e_ee [m] | J_upper [Nm] | fell |", "|---|---|---|---|---|---|",
+    ]  # fmt: skip
+    rows = {"PD": ["--method", "pd"]} | {
+        f"K {k}, alpha {a:g}": ["--method", "cotap", "--stiffness", str(k), "--alpha", str(a)]
+        for k, a in ((100, 1.0), (300, 1.0), (100, 0.7), (100, 0.3))
+    }
+    wins = []
+    for mode, where in {"stance": [], "walking": ["--mode", "walking", "--random-direction"]}.items():
+        pd = None
+        for name, law in rows.items():
+            result = runs(f"pd-{mode}-{name.replace(' ', '')}", "impact", "--num-envs", str(envs), *where, *law)
+            m = result["metrics_without_falls"]
+            figures = [m[key] for key in ("e_torso", "e_ee", "j_upper")]
+            pd = pd or figures
+            if all(mine["ci95"][1] < theirs["ci95"][0] for mine, theirs in zip(figures, pd, strict=True)):
+                wins.append(f"{mode}, {name}")
+            cells = [number(f, d) for f, d in zip(figures, (3, 3, 1), strict=True)]
+            lines.append(f"| {mode} | {name} | " + " | ".join(cells) + f" | {result['num_falls']} of {envs} |")
+    return [*lines, "", f"Better than PD in all three beyond the intervals: {'; '.join(wins) or 'none'}.", ""]
+
+
+def changing(runs: Runs, envs: int) -> list[str]:
+    """Stiffness and blend changed over their whole range."""
+    lines = [
+        "## Stiffness that changes", "",
+        f"Stiffness and alpha stepped and ramped over their whole range, {envs} worlds.", "",
+        "| case | fell | peak arm torque [Nm] | energy [J] |", "|---|---|---|---|",
+    ]  # fmt: skip
+    for mode in ("walking", "stance"):
+        result = runs(f"changing-{mode}", "modulation", "--num-envs", str(envs), "--mode", mode)
+        m = result["metrics"]
+        lines.append(
+            f"| {mode} | {result['num_falls']} of {envs} | {number(m['peak_torque'], 1)} | {number(m['energy'], 0)} |"
+        )
+    return [*lines, ""]
+
+
+def main() -> int:
+    """Measure and write. Exit status."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--checkpoint", default="cotap", help="the distilled policy; the base is the shipped one")
+    parser.add_argument("--num-envs", type=int, default=1024)
+    parser.add_argument("--walking-envs", type=int, default=512)
+    parser.add_argument("--walking-seconds", type=float, default=10.0)
+    parser.add_argument("--threads", type=int, default=0)
+    parser.add_argument("--reuse", action="store_true", help="keep evaluations that are there")
+    parser.add_argument("--evaluations", type=Path, default=Path("runs/distillation"))
+    parser.add_argument("--output", type=Path, default=Path("docs/distillation.md"))
+    options = parser.parse_args()
+    options.evaluations.mkdir(parents=True, exist_ok=True)
+    runs = Runs(options.evaluations, options.checkpoint, options.threads, options.reuse)
+    from cotap.agents.checkpoint import write_atomically
+
+    lines = [
+        "# What distillation did",
+        "",
+        f"Written by `scripts/distillation_report.py`; policy `{options.checkpoint}`.",
+        "",
+    ]
+    lines += walking(runs, options.walking_envs, options.walking_seconds)
+    lines += obedience(runs, options.num_envs)
+    lines += against_pd(runs, options.num_envs)
+    lines += changing(runs, options.num_envs)
+    write_atomically(options.output, lambda p: p.write_text("\n".join(lines)))
+    print(options.output.read_text())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
