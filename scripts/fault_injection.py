@@ -374,6 +374,13 @@ def full_disk(work: Path, reference: Path) -> list[Row]:
         _mount("-t", "tmpfs", "-o", "size=12M", "tmpfs", disk)
     except (OSError, subprocess.CalledProcessError) as error:
         return [Row("full disk", 0, 0, None, f"not injected: file systems cannot be mounted here ({error})")]
+    try:
+        return _on_disk(disk, work, reference)
+    finally:
+        subprocess.run(["umount", "--lazy", str(disk)], check=True)
+
+
+def _on_disk(disk: Path, work: Path, reference: Path) -> list[Row]:
     ballast = disk / "ballast"
 
     def fill(_env: H1Env) -> None:

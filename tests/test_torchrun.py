@@ -111,10 +111,11 @@ def test_two_hosts_train_one_policy(tmp_path: Path):
     meet = ["--nnodes=2", "--nproc-per-node=1", "--rdzv-backend=c10d", "--rdzv-endpoint=10.99.0.1:29400"]
     train = command(tmp_path / "run", 3)
     launch = [*LAUNCH[:3], *meet, *train[len(LAUNCH) :]]
-    # torchrun knows a host by its name, which namespaces share: each is told its address, 10.99.0.1 on v1 and so on.
-    own_address = [*launch[:3], "--local-addr", "10.99.0.N", *launch[3:]]
-    script = 'exec "${@/10.99.0.N/10.99.0.${GLOO_SOCKET_IFNAME#v}}"'
-    result = run([*IN_NAMESPACES, "bash", "-c", script, "bash", *own_address])
+    # torchrun knows hosts by their names, which namespaces share: each is told its address, and the first that it is
+    # where they meet.
+    own = [*launch[:3], "--local-addr", "10.99.0.N", "--rdzv-conf", "is_host=N", *launch[3:]]
+    script = 'n=${GLOO_SOCKET_IFNAME#v}; set -- "${@/10.99.0.N/10.99.0.$n}"; exec "${@/is_host=N/is_host=$((2 - n))}"'
+    result = run([*IN_NAMESPACES, "bash", "-c", script, "bash", *own])
     assert result.returncode == 0, result.stderr
     content = load_checkpoint(tmp_path / "run" / "checkpoint_000003.pt")
     assert content["samples"] == 3 * 4 * 2 * 4

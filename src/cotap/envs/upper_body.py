@@ -321,7 +321,7 @@ def _choose(mine: torch.Tensor, answer: TorqueLaw, other: TorqueLaw) -> TorqueLa
 class _TorsoModel:
     """The hands' compliance through the torso, in the heading frame."""
 
-    def __init__(self, cfg: TorsoComplianceConfig, spec: RobotSpec, dtype: torch.dtype) -> None:
+    def __init__(self, cfg: TorsoComplianceConfig, spec: RobotSpec, dtype: torch.dtype = torch.float32) -> None:
         self._cfg = cfg
         gains = {j.name: j.kp for j in spec.joints}
         self._constant = torch.diag(1.0 / torch.tensor(cfg.stiffness, dtype=dtype))

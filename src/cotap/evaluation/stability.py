@@ -68,7 +68,7 @@ class Stability:
         """Turn an environment into that of the trials of energy. Changes and returns `env`."""
         self.check()
         env.num_envs, env.seed, env.fixed_base = self.num_envs, self.seed, True
-        env.assist.enabled = env.hand_forces.enabled = env.randomization.enabled = False
+        env.assist.enabled = env.hand_forces.enabled = env.blows.enabled = env.randomization.enabled = False
         env.observations.noise.enabled = False
         env.motions.clips.share = 0.0
         env.terminations.episode_s = 1e6
@@ -123,16 +123,18 @@ class SwingingForces:
     def __init__(self, protocol: Stability, num_hands: int, rng: torch.Generator) -> None:
         n = protocol.num_envs
         direction = torch.randn(n, num_hands, 3, generator=rng)
-        self._amplitude = protocol.force * direction / direction.norm(dim=-1, keepdim=True)
+        amplitude = protocol.force * direction / direction.norm(dim=-1, keepdim=True)
         low, high = (math.log(bound) for bound in protocol.frequency)
-        self._rate = 2.0 * math.pi * uniform(rng, low, high, n, num_hands, 1).exp()
+        rate = 2.0 * math.pi * uniform(rng, low, high, n, num_hands, 1).exp()
+        # The base, last, is left alone.
+        self._amplitude, self._rate = (torch.nn.functional.pad(x, (0, 0, 0, 1)) for x in (amplitude, rate))
         self._start_s = protocol.settle_seconds
 
     def reset(self, mask: torch.Tensor, rng: torch.Generator) -> None:
         """Trials go on as they are."""
 
     def at(self, time_s: torch.Tensor) -> torch.Tensor:
-        """Forces (N, H, 3) [N] at times (N,) [s]."""
+        """Forces (N, H + 1, 3) [N] on hands and base at times (N,) [s]."""
         since = (time_s - self._start_s)[:, None, None]
         return (since > -1e-4) * torch.sin(self._rate * since) * self._amplitude
 
@@ -160,7 +162,7 @@ def exchanged_energy(env: H1Env, protocol: Stability) -> torch.Tensor:
             draw = uniform(rng, -0.5, 0.5, *stiffness.shape)
             changed = stiffness * protocol.change_factor**draw
             env.upper_body.parameters.stiffness = torch.where(changing[:, None, None], changed, stiffness)
-        before, force = _hands(env), forces.at(env.dt * env.episode_length_buf)
+        before, force = _hands(env), forces.at(env.dt * env.episode_length_buf)[:, :-1]
         _, _, _, extras = env.step(action)
         # Where a world has diverged it has been restarted: it has given all that can be.
         moved = torch.where(extras["falls"][:, None, None], torch.full_like(before, -math.inf), _hands(env) - before)

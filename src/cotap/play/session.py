@@ -101,7 +101,7 @@ class Session:
         s = env.state
         hands = s.torso_pos_w.unsqueeze(1) + s.arms.tip @ s.torso_rotation_w.transpose(1, 2)
         force_h = self.loads.step(hands, s.heading_w)
-        env.scripted.amplitude_h = force_h
+        env.scripted.amplitude_h[:, :-1] = force_h
         self._observations, _, done, extras = env.step(self._act())
         self.num_steps += 1
         laws = [[self.values[f"{robot}.{side}.law"] for side in self.sides] for robot in ROBOTS]
