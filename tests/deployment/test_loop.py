@@ -268,7 +268,7 @@ def test_a_scenario_is_read_and_run(policy_file, tmp_path, spec, capsys):
         ("command = 3", "command must be a list"),
         ("arms = 'up'", "arms must be a table"),
         ("[[command]]\nvelocity = [1.0]", r"command\[0\].velocity must have 2 entries"),
-        ("[[command]]\nstand = 1", "command\[0\].stand must be of type bool"),
+        ("[[command]]\nstand = 1", r"command\[0\].stand must be of type bool"),
         ("[[command]]\nstand = true\nvelocity = [0.1, 0.0]", "stands and moves"),
         ("[[command]]\nat = 2\n[[command]]\nat = 1", "before the one ahead"),
         ("[[force]]\nforce = [1, 2, 3]\nhand = 'foot'", "force.hand 'foot' is unknown"),
