@@ -8,7 +8,7 @@ import torch
 
 from cotap.agents.checkpoint import load_checkpoint, save_checkpoint, sha256
 from cotap.evaluate import main
-from cotap.evaluation.policy import load_policy, shipped_checkpoint
+from cotap.evaluation.policy import load_policy, shipped_checkpoint, shipped_names
 from cotap.evaluation.render import RenderingUnavailable, open_renderer
 from cotap.robots import h1
 from cotap.robots.mjcf import build_model
@@ -22,21 +22,23 @@ def run(tmp_path: Path, *options: str, name: str = "result.json") -> dict:
     return json.loads(out.read_text())
 
 
-def test_shipped_policy_reproduces_its_evaluation(tmp_path: Path):
-    path = shipped_checkpoint("base")
-    shipped = json.loads(path.with_name("base.velocity-tracking.small.json").read_text())
-    result = run(tmp_path)
+@pytest.mark.parametrize("name", shipped_names())
+def test_shipped_policy_reproduces_its_evaluation(tmp_path: Path, name: str):
+    path = shipped_checkpoint(name)
+    shipped = json.loads(path.with_name(f"{name}.velocity-tracking.small.json").read_text())
+    result = run(tmp_path, "--checkpoint", str(path), "--method", shipped["method"])
     assert shipped["settings"]["checkpoint_sha256"] == sha256(path) == result["settings"]["checkpoint_sha256"]
     # Another processor rounds otherwise, and walking is chaotic: figures agree, digits need not.
-    for name in ("e_lin_gait", "e_yaw_gait", "e_height", "e_upper", "swing_height"):
-        assert result["metrics"][name]["mean"] == pytest.approx(shipped["metrics"][name]["mean"], rel=0.1), name
+    for key in ("e_lin_gait", "e_yaw_gait", "e_height", "e_upper", "swing_height"):
+        assert result["metrics"][key]["mean"] == pytest.approx(shipped["metrics"][key]["mean"], rel=0.1), key
     assert result["num_falls"] <= shipped["num_falls"] + 1
     for axis in ("slope_x", "slope_y", "slope_yaw"):
         assert result["slopes"][axis] == pytest.approx(shipped["slopes"][axis], abs=0.08)
 
 
-def test_shipped_checkpoint_carries_its_provenance():
-    path = shipped_checkpoint("base")
+@pytest.mark.parametrize("name", shipped_names())
+def test_shipped_checkpoint_carries_its_provenance(name: str):
+    path = shipped_checkpoint(name)
     provenance = json.loads(path.with_suffix(".json").read_text())
     assert provenance["sha256"] == sha256(path)
     assert {"commit", "command", "seed", "samples", "wall_seconds", "config"} <= provenance.keys()
