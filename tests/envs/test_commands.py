@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from cotap.envs.commands import CommandConfig, CommandSource, leaning
+from cotap.envs.gait import swing_progress
 
 NOMINAL, DT = 1.0205, 0.02
 AT_ONCE = {"acceleration": 1000.0, "yaw_acceleration": 1000.0}
@@ -157,7 +158,6 @@ def test_a_standing_robot_that_leans_steps_until_it_is_steady(rng):
         commands.step(rng, torch.tensor([0.39]))
     assert float(commands.current().stand) == 1.0
     assert float(commands.current().height) == pytest.approx(NOMINAL - 0.2)
-    start = float(commands.current().phase)
     stands = []
     for i in range(60):
         commands.step(rng, torch.tensor([0.41 if i < 25 else 0.1]))
@@ -165,12 +165,28 @@ def test_a_standing_robot_that_leans_steps_until_it_is_steady(rng):
     # Half a stride is 20 steps: at the first double support it still leans, at the second it is steady.
     assert stands[:38] == [0.0] * 38
     assert stands[42:] == [1.0] * 18
-    assert float(commands.current().phase) == start
+    assert float(commands.current().phase) == 0.0
     walking = source(1)
     walking.override(torch.zeros(1, 2), torch.zeros(1), torch.zeros(1), torch.tensor([NOMINAL]))
     walking.reset(everyone(1), rng)
     walking.step(rng, torch.tensor([9.0]))
     assert float(walking.current().stand) == 0.0
+
+
+@pytest.mark.parametrize("rest", [0.0, 0.5])
+def test_balance_is_caught_with_the_foot_that_the_turn_carries_forward(rng, rest):
+    commands = source(3, steady_rad=0.2)
+    commands.override(torch.zeros(3, 2), torch.zeros(3), torch.ones(3), torch.full((3,), NOMINAL))
+    commands.reset(everyone(3), rng)
+    commands._phase[:] = rest
+    commands.step(rng, torch.tensor([0.3, 0.3, 0.1]), torch.tensor([-1.0, 1.0, -1.0]))  # to the right, the left, steady
+    swings = []
+    for _ in range(10):
+        swings.append(swing_progress(commands.current().phase, 2) > 0.0)
+        commands.step(rng, torch.tensor([0.3, 0.3, 0.1]), torch.tensor([1.0, -1.0, 1.0]))  # too late to choose again
+    left, right = torch.stack(swings).any(0).unbind(1)
+    assert left.tolist() == [True, False, False]
+    assert right.tolist() == [False, True, False]
 
 
 def test_leaning_by_hand():

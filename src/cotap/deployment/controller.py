@@ -136,7 +136,9 @@ class Controller:
         """The law for the next control step. The first call fills the observation's history."""
         s = readings.state
         if self._started:
-            self.commands.step(self._rng, leaning(s.projected_gravity_t, s.torso_angular_velocity_t).float())
+            turning = s.torso_angular_velocity_t
+            lean = leaning(s.projected_gravity_t, turning)
+            self.commands.step(self._rng, lean.float(), turning[:, 2].float())
             self.upper_body.step(self.dt, self._rng)
         observed = self.motion.current().position
         values = actor_values(

@@ -298,7 +298,8 @@ class H1Env(VecEnv):
         self.samples += self._worlds_in_all
         self.episode_length_buf += 1
         s = self.state
-        self.commands.step(self.rng, leaning(s.projected_gravity_t, s.torso_angular_velocity_t))
+        turning = s.torso_angular_velocity_t
+        self.commands.step(self.rng, leaning(s.projected_gravity_t, turning), turning[:, 2])
         self._follow_path()
         if self.upper_body.active:
             self.upper_body.sense(s, self._hand_force_w, self._arm_effort)
