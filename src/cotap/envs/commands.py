@@ -131,12 +131,15 @@ class CommandSource(Stateful):
         start = torch.rand(int(mask.sum()), generator=rng)
         self._phase[mask] = torch.where(stand > 0.5, 0.5 * (start < 0.5), start)
 
-    def step(self, rng: torch.Generator, lean: torch.Tensor | None = None) -> None:
+    def step(
+        self, rng: torch.Generator, lean: torch.Tensor | None = None, turning: torch.Tensor | None = None
+    ) -> None:
         """Advance clocks by one control step and resample what is due.
 
         Args:
             rng: Random numbers.
             lean: (N,) how far each robot is about to lean [rad], from `leaning`; None counts as upright.
+            turning: (N,) how fast each robot turns, positive to the left [rad/s]; None counts as not at all.
         """
         self._remaining_s -= self._dt
         self._draw(self._remaining_s <= 0.0, rng)
@@ -145,11 +148,18 @@ class CommandSource(Stateful):
         wanted = torch.where(self._stand > 0.5, self._target[:, 4], self._target[:, 4].clamp_min(self._nominal))
         self._height = self._height + (wanted - self._height).clamp(-limit, limit)
         self._velocity = self._velocity + (self._target[:, :3] - self._velocity).clamp(-self._rate, self._rate)
-        self._advance_gait(torch.zeros_like(self._phase) if lean is None else lean)
+        nothing = torch.zeros_like(self._phase)
+        self._advance_gait(nothing if lean is None else lean, nothing if turning is None else turning)
 
-    def _advance_gait(self, lean: torch.Tensor) -> None:
-        """Run the clock while walking; come to rest at the next double support, 0 or 0.5, once asked to and steady."""
+    def _advance_gait(self, lean: torch.Tensor, turning: torch.Tensor) -> None:
+        """Run the clock while walking; come to rest at the next double support, 0 or 0.5, once asked to and steady.
+
+        A standing robot that steps for its balance begins with the left foot, phase 0.5, if it is being turned to the
+        right, else with the right one: the foot that the turn carries forward. With the other one it crosses its legs.
+        """
         steady = lean <= self.cfg.steady_rad
+        catches = (self._stand > 0.5) & ~steady
+        self._phase = torch.where(catches, 0.5 * (turning < 0.0), self._phase)
         half_strides = 2.0 * (self._phase + self._dt / self.cfg.gait_period_s)
         both_down = half_strides.floor() > (2.0 * self._phase).floor()
         at_rest = (self._velocity == 0.0).all(1) & (self._target[:, 3] > 0.5) & steady

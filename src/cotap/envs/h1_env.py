@@ -305,7 +305,8 @@ class H1Env(VecEnv):
         self.samples += self.num_envs
         self.episode_length_buf += 1
         s = self.state
-        self.commands.step(self.rng, leaning(s.projected_gravity_t, s.torso_angular_velocity_t))
+        turning = s.torso_angular_velocity_t
+        self.commands.step(self.rng, leaning(s.projected_gravity_t, turning), turning[:, 2])
         self._follow_path()
         self.upper_body.step(self.dt, self.rng)
         self.hand_forces.step(self.rng)
