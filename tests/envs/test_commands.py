@@ -175,18 +175,19 @@ def test_a_standing_robot_that_leans_steps_until_it_is_steady(rng):
 
 @pytest.mark.parametrize("rest", [0.0, 0.5])
 def test_balance_is_caught_with_the_foot_that_the_turn_carries_forward(rng, rest):
-    commands = source(3, steady_rad=0.2)
-    commands.override(torch.zeros(3, 2), torch.zeros(3), torch.ones(3), torch.full((3,), NOMINAL))
-    commands.reset(everyone(3), rng)
+    commands = source(4, steady_rad=0.2)
+    commands.override(torch.zeros(4, 2), torch.zeros(4), torch.ones(4), torch.full((4,), NOMINAL))
+    commands.reset(everyone(4), rng)
     commands._phase[:] = rest
-    commands.step(rng, torch.tensor([0.3, 0.3, 0.1]), torch.tensor([-1.0, 1.0, -1.0]))  # to the right, the left, steady
+    lean = torch.tensor([0.3, 0.3, 0.1, 0.3])
+    commands.step(rng, lean, torch.tensor([-1.5, 1.5, -1.5, -0.5]))  # to the right, the left, steady, hardly turned
     swings = []
     for _ in range(10):
         swings.append(swing_progress(commands.current().phase, 2) > 0.0)
-        commands.step(rng, torch.tensor([0.3, 0.3, 0.1]), torch.tensor([1.0, -1.0, 1.0]))  # too late to choose again
+        commands.step(rng, lean, torch.tensor([1.5, -1.5, 1.5, 1.5]))  # too late to choose again
     left, right = torch.stack(swings).any(0).unbind(1)
-    assert left.tolist() == [True, False, False]
-    assert right.tolist() == [False, True, False]
+    assert left.tolist() == [True, False, False, rest == 0.5]
+    assert right.tolist() == [False, True, False, rest == 0.0]
 
 
 def test_leaning_by_hand():

@@ -13,6 +13,9 @@ from cotap.envs.persistence import Stateful, uniform
 STEADY_RAD = 0.2
 """Lean at which a standing robot steps outside of training [rad]: 19 of 20 that fall have leant so far 0.4 s before."""
 
+TURNED_RAD_S = 1.0
+"""Yaw rate from which a robot counts as turned by a blow [rad/s]; balance is lost at less, and then says nothing."""
+
 
 @dataclass
 class CommandConfig:
@@ -152,11 +155,11 @@ class CommandSource(Stateful):
     def _advance_gait(self, lean: torch.Tensor, turning: torch.Tensor) -> None:
         """Run the clock while walking; come to rest at the next double support, 0 or 0.5, once asked to and steady.
 
-        A standing robot that steps for its balance begins with the left foot, phase 0.5, if it is being turned to the
-        right, else with the right one: the foot that the turn carries forward. With the other one it crosses its legs.
+        A standing robot that steps for its balance while it is being turned begins with the foot that the turn carries
+        forward: the left one, phase 0.5, if it is turned to the right. With the other one it would cross its legs.
         """
         steady = lean <= self.cfg.steady_rad
-        catches = (self._stand > 0.5) & ~steady
+        catches = (self._stand > 0.5) & ~steady & (turning.abs() > TURNED_RAD_S)
         self._phase = torch.where(catches, 0.5 * (turning < 0.0), self._phase)
         half_strides = 2.0 * (self._phase + self._dt / self.cfg.gait_period_s)
         both_down = half_strides.floor() > (2.0 * self._phase).floor()
