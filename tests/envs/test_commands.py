@@ -158,6 +158,7 @@ def test_a_standing_robot_that_leans_steps_until_it_is_steady(rng):
         commands.step(rng, torch.tensor([0.39]))
     assert float(commands.current().stand) == 1.0
     assert float(commands.current().height) == pytest.approx(NOMINAL - 0.2)
+    start = float(commands.current().phase)
     stands = []
     for i in range(60):
         commands.step(rng, torch.tensor([0.41 if i < 25 else 0.1]))
@@ -165,7 +166,7 @@ def test_a_standing_robot_that_leans_steps_until_it_is_steady(rng):
     # Half a stride is 20 steps: at the first double support it still leans, at the second it is steady.
     assert stands[:38] == [0.0] * 38
     assert stands[42:] == [1.0] * 18
-    assert float(commands.current().phase) == 0.0
+    assert float(commands.current().phase) == start
     walking = source(1)
     walking.override(torch.zeros(1, 2), torch.zeros(1), torch.zeros(1), torch.tensor([NOMINAL]))
     walking.reset(everyone(1), rng)
