@@ -109,8 +109,8 @@ def compare(policy: OnnxPolicy, cfg: Comparison) -> dict[str, Any]:
 
         result["engines"][name] = {
             "velocity-tracking": tracking(run(Scenario(cfg.seconds), cfg.trials), policy, cfg),
-            "impact": loads(run, spec, Impact(onset=ONSET_S), cfg),
-            "constant-load": loads(run, spec, ConstantLoad(onset=ONSET_S), cfg),
+            "impact": loads(run, spec, Impact(onset=ONSET_S, episode_seconds=ONSET_S + 2.0), cfg),
+            "constant-load": loads(run, spec, ConstantLoad(onset=ONSET_S, episode_seconds=ONSET_S + 4.0), cfg),
             "periodic-load": periodic(run, spec, cfg),
         }
         if name == cfg.engines[0]:

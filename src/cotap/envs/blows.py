@@ -11,6 +11,7 @@ from cotap.checks import require_interval, require_range
 from cotap.envs.persistence import Stateful, uniform
 
 _LARGEST_PITCH_RAD = 0.5
+NEVER_S = 1e9
 
 
 @dataclass
@@ -57,7 +58,7 @@ class Blows(Stateful):
         cfg.check()
         self.cfg, self._dt = cfg, dt
         self._force_h = torch.zeros(num_envs, num_hands, 3)
-        self._since_s = torch.full((num_envs,), math.inf)
+        self._since_s = torch.full((num_envs,), NEVER_S)
         """Since the last blow set in."""
         self._duration_s = torch.zeros(num_envs)
         self._interval_s = torch.full((num_envs,), cfg.interval_s[1])
@@ -72,7 +73,7 @@ class Blows(Stateful):
         self._since_s[mask] = self.cfg.recovery_s + self._dt
         self._interval_s[mask] = uniform(rng, *self.cfg.interval_s, int(mask.sum())) + self.cfg.recovery_s
         spared = torch.rand(int(mask.sum()), generator=rng) >= self.cfg.episode_share
-        self._interval_s[mask] = torch.where(spared, torch.inf, self._interval_s[mask])
+        self._interval_s[mask] = torch.where(spared, NEVER_S, self._interval_s[mask])
 
     def recovering(self) -> torch.Tensor:
         """(N,) bool: a blow set in no longer ago than `recovery_s`."""
