@@ -126,7 +126,7 @@ def against_pd(runs: Runs, envs: int) -> list[str]:
     ]  # fmt: skip
     rows = {"PD": ["--method", "pd"]} | {
         f"K {k}, alpha {a:g}": ["--method", "cotap", "--stiffness", str(k), "--alpha", str(a)]
-        for k, a in ((100, 1.0), (300, 1.0), (100, 0.7), (100, 0.3))
+        for k, a in ((100, 1.0), (300, 1.0), (100, 0.7), (200, 0.5), (100, 0.3))
     }
     wins = []
     for mode, where in {"stance": [], "walking": ["--mode", "walking", "--random-direction"]}.items():
@@ -150,11 +150,17 @@ def changing(runs: Runs, envs: int) -> list[str]:
         f"Stiffness and alpha stepped and ramped over their whole range, {envs} worlds.", "",
         "| case | fell | peak arm torque [Nm] | energy [J] |", "|---|---|---|---|",
     ]  # fmt: skip
-    for mode in ("walking", "stance"):
-        result = runs(f"changing-{mode}", "modulation", "--num-envs", str(envs), "--mode", mode)
+    loads = {"": [], ", 15 N down on the left hand": ["--force", "0", "0", "-15"]}
+    cases = {
+        f"{mode}{label}": ["--mode", mode, *load] for label, load in loads.items() for mode in ("walking", "stance")
+    }
+    for case, options in cases.items():
+        result = runs(
+            f"changing-{case.replace(' ', '-').replace(',', '')}", "modulation", "--num-envs", str(envs), *options
+        )
         m = result["metrics"]
         lines.append(
-            f"| {mode} | {result['num_falls']} of {envs} | {number(m['peak_torque'], 1)} | {number(m['energy'], 0)} |"
+            f"| {case} | {result['num_falls']} of {envs} | {number(m['peak_torque'], 1)} | {number(m['energy'], 0)} |"
         )
     return [*lines, ""]
 
