@@ -274,7 +274,9 @@ def velocity_tracking(options: VelocityTrackingOptions) -> dict[str, Any]:
         from cotap.evaluation.render import tour_video
 
         video = Path(options.video)
-        tour_video(video, from_plain(H1EnvConfig, policy.config["training"]["env"]), policy, video.with_suffix(".png"))
+        filmed = from_plain(H1EnvConfig, policy.config["training"]["env"])
+        filmed.upper_body = options.laws.configure()
+        tour_video(video, filmed, policy, video.with_suffix(".png"))
     return result
 
 

@@ -93,7 +93,7 @@ def record_rollout(
     obs = env.reset()
     record: dict[str, torch.Tensor] = {}
     frames: list[torch.Tensor] = []
-    for step in tqdm(range(steps), desc="rollout", unit="step", disable=not progress, leave=False):
+    for step in tqdm(range(steps), desc="rollout", unit="step", disable=None if progress else True, leave=False):
         if before_step:
             before_step(env, step)
         action = policy(as_dict(obs))

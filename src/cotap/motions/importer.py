@@ -64,7 +64,7 @@ def import_motions(
     """
     result = ImportResult([], [], [], [])
     taken: set[str] = set()
-    for path in tqdm(find_files(sources), desc="import", unit="file", disable=not progress, leave=False):
+    for path in tqdm(find_files(sources), desc="import", unit="file", disable=None if progress else True, leave=False):
         for label, outcome in _read_file(path, spec, file_format):
             if isinstance(outcome, str):
                 result.failures.append((label, outcome))
