@@ -10,7 +10,7 @@ from pathlib import Path
 
 OUT = Path("runs/demo")
 IMPACT = ["impact", "--num-envs", "256", "--force", "500", "0", "0"]
-METHODS = {"pd": ["--method", "pd"], "cotap": ["--method", "cotap", "--stiffness", "500"]}
+METHODS = {"pd": ["--method", "pd"], "cotap": ["--method", "cotap", "--stiffness", "200", "--alpha", "0.5"]}
 MEASURES = {
     "e_torso": "torso velocity error [m/s]",
     "e_ee_hit": "error of the hand that is struck [m]",
@@ -35,7 +35,9 @@ def main() -> int:
     resumed = ["distill", "--resume", str(cotap), "--run-dir", str(OUT / "training"), "--iterations", "6"]
     if status := train([*resumed, "--num-envs", "1024", "--threads", "0"]):
         return status
-    print("2. A blow of 500 N for 50 ms on the left hand, 256 randomised worlds, under PD and under CoTaP at 500 N/m")
+    print(
+        "2. A blow of 500 N for 50 ms on the left hand, 256 randomised worlds, under PD and under CoTaP (200 N/m, alpha 0.5)"
+    )
     for name, options in METHODS.items():
         files = ["--json", str(OUT / f"impact_{name}.json"), "--plot", str(OUT / f"impact_{name}.png")]
         if status := evaluate([*IMPACT, *options, *files, "--checkpoint", str(cotap)]):
