@@ -35,9 +35,7 @@ def main() -> int:
     resumed = ["distill", "--resume", str(cotap), "--run-dir", str(OUT / "training"), "--iterations", "6"]
     if status := train([*resumed, "--num-envs", "1024", "--threads", "0"]):
         return status
-    print(
-        "2. A blow of 500 N for 50 ms on the left hand, 256 randomised worlds, under PD and under CoTaP (200 N/m, alpha 0.5)"
-    )
+    print("2. A blow of 500 N for 50 ms on the left hand, 256 worlds, under PD and under CoTaP (200 N/m, alpha 0.5)")
     for name, options in METHODS.items():
         files = ["--json", str(OUT / f"impact_{name}.json"), "--plot", str(OUT / f"impact_{name}.png")]
         if status := evaluate([*IMPACT, *options, *files, "--checkpoint", str(cotap)]):
