@@ -113,7 +113,7 @@ def _train(args: list[str], log: Path, beats: int, prepare: Prepare | None) -> N
         if prepare:
             prepare()
         status = train.main(args)
-    except Exception:
+    except Exception:  # a forked child leaves by os._exit, which prints nothing: whatever it was must be in its log
         traceback.print_exc()
     finally:
         for stream in (sys.stdout, sys.stderr):

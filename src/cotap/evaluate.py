@@ -84,7 +84,7 @@ class ScenarioOptions(CommonOptions):
 
     video: str = ""
     """Write a video of the first world here (MP4); a contact sheet (PNG) goes beside it."""
-    protocol: tyro.conf.OmitArgPrefixes[Scenario] = field(default_factory=Scenario)
+    protocol: tyro.conf.OmitArgPrefixes[Scenario] = field(kw_only=True)
 
 
 @dataclass

@@ -164,7 +164,7 @@ class DualRunner(OnPolicyRunner):
                         self._log(run_log, scalars)
                     if (it + 1) % self.runner_cfg.save_interval == 0 or self._save_failed:
                         self._save_or_report()
-                except Exception as error:
+                except Exception as error:  # whatever it was, a long run must not end without saying how to go on
                     raise TrainingFault(self._fault(it + 1, error)) from error
                 bar.update()
                 bar.set_postfix_str(_summary(scalars))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ MIXTURE = "mixture"
 
 
 @dataclass
-class Scenario:
+class Scenario(ABC):
     """A robot that stands or walks while its arms hold a pose or follow a motion."""
 
     num_envs: int = 1024
@@ -64,9 +65,9 @@ class Scenario:
             raise ValueError(f"motion {MIXTURE!r} stands alone, got {self.motion}")
 
     @property
+    @abstractmethod
     def seconds(self) -> float:
         """Length of the evaluation [s]."""
-        raise NotImplementedError
 
     def configure(self, env: H1EnvConfig) -> H1EnvConfig:
         """Turn the environment that a policy was trained in into this protocol's. Changes and returns `env`."""
@@ -94,16 +95,16 @@ class Scenario:
         if not self.motion:
             env.motions.hold(mirrored_pose(env, self.arm_pose))
 
-    def before_step(self, env: H1Env, step: int) -> None:
+    def before_step(self, env: H1Env, step: int) -> None:  # noqa: B027  (most protocols change nothing)
         """Whatever the protocol changes as it goes along."""
 
+    @abstractmethod
     def measure(self, trajectory: Trajectory, env: H1Env) -> dict[str, Any]:
         """The measured part of the evaluation's JSON."""
-        raise NotImplementedError
 
+    @abstractmethod
     def plot(self, path: Path, result: dict[str, Any]) -> None:
         """Draw a result, as a PNG file."""
-        raise NotImplementedError
 
 
 def mirrored_pose(env: H1Env, left: tuple[float, ...]) -> torch.Tensor:
