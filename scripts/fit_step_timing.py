@@ -7,6 +7,7 @@ it was not shown, and writes the weights that the package ships.
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from pathlib import Path
 
@@ -40,7 +41,7 @@ class RandomCatch:
         self._default = torch.tensor([j.default_rad for j in env.spec.joints])
         self._delay = torch.zeros(n, dtype=torch.long)
         self._age = torch.full((n,), 1_000_000)
-        self._left_s = env.hand_forces._remaining_s
+        self._left_s = env.hand_forces._remaining_s.clone()
         """Until the loads on the hands change."""
         self.seen = torch.zeros(n, 9 + 2 * env.num_actions)
         self.choice = torch.zeros(n)
@@ -50,7 +51,7 @@ class RandomCatch:
 
     def reset(self, mask: torch.Tensor) -> None:
         """Trials in `mask` (N,) are void."""
-        self._left_s = self._env.hand_forces._remaining_s
+        self._left_s[mask] = math.inf  # new loads at a start are no event
         self.open[mask] = False
         self._age[mask] = 1_000_000
 
@@ -59,7 +60,7 @@ class RandomCatch:
         n, rng = self._env.num_envs, self._env.rng
         left_s = self._env.hand_forces._remaining_s
         struck = (self._env.blows._since_s == 0.0) | (left_s > self._left_s)
-        self._left_s = left_s
+        self._left_s = left_s.clone()
         self._age = torch.where(struck, 0, self._age + 1)
         self._delay = torch.where(struck, torch.randint(*SOON_STEPS, (n,), generator=rng), self._delay)
         now = self._age == self._delay
@@ -97,7 +98,7 @@ def collect(options: argparse.Namespace) -> int:
     loads.episode_share, loads.curriculum_step, loads.curriculum_back = 1.0, 0.0, 0.0
     blows.enabled, blows.episode_share, blows.curriculum_start = options.loads == 0.0, 1.0, 1.0
     blows.curriculum_step = blows.curriculum_back = 0.0
-    blows.force, blows.duration_s, blows.interval_s = (0.0, 600.0), (0.02, 0.06), (WATCH_S + 0.3, WATCH_S + 0.8)
+    blows.force, blows.duration_s, blows.interval_s = (100.0, 600.0), (0.03, 0.06), (WATCH_S + 0.3, WATCH_S + 0.8)
     env = H1Env(cfg)
     env.step_timing = trials = RandomCatch(env)  # pyright: ignore[reportAttributeAccessIssue]
     env.reset()
