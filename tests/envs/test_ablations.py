@@ -77,7 +77,10 @@ def test_the_threshold_of_the_ratio_is_the_laws_own(make_env):
     """One that no arm reaches is none; arms of one environment may differ."""
     far = LawConfig("cotap", alpha=0.6, condition_threshold=1e9)
     stiffness = []
-    for cfg in (UpperBodyConfig(far, LawConfig("cotap", alpha=0.6)), UpperBodyConfig(far, far, singularity_ratio=False)):
+    for cfg in (
+        UpperBodyConfig(far, LawConfig("cotap", alpha=0.6)),
+        UpperBodyConfig(far, far, singularity_ratio=False),
+    ):
         env = make_env(1, upper_body=cfg)
         env.sim.qpos[:, 7 + 14] = env.sim.qpos[:, 7 + 18] = 1.45
         env.state = env.reader.read()
