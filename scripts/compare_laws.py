@@ -31,8 +31,9 @@ from cotap.evaluate import ImpactOptions, StaticStiffnessOptions, scenario, stat
 from cotap.evaluation.disturbance import Impact
 from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.report import save_figure
+from cotap.evaluation.scenario import mirrored_pose
 from cotap.evaluation.stability import Stability, energy_summary, exchanged_energy, growth_rates
-from cotap.evaluation.static import StaticStiffness, measure
+from cotap.evaluation.static import StaticStiffness, settle
 from cotap.evaluation.wrong_model import misjudge
 from cotap.robots import h1
 
@@ -291,10 +292,9 @@ class Properties:
         self.stability.check()
         rows = {}
         for name in self.laws:
-            soft, _ = self._moved(name, 0.5 * self.stiffness)
-            stiff, _ = self._moved(name, 2.0 * self.stiffness)
-            right, at = self._moved(name, self.stiffness)
-            wrong, misled = self._moved(name, self.stiffness, wrong=True)
+            k = self.stiffness
+            (soft, stiff, right), at = self._moved(name, (0.5 * k, 2.0 * k, k))
+            (wrong,), misled = self._moved(name, (k,), wrong=True)
             arms = laws_of(name, self.stiffness).configure()
             cfg = self.stability.configure(H1EnvConfig(num_threads=self.threads))
             cfg.upper_body = arms
@@ -308,16 +308,23 @@ class Properties:
             print(f"  {name}", file=sys.stderr)
         return {"rows": rows}
 
-    def _moved(self, name: str, stiffness: float, wrong: bool = False) -> tuple[float, torch.Tensor]:
-        """Downward displacement under the load, pelvis fixed, and where (3,) the hand is without one [m]."""
-        protocol = StaticStiffness(force=(0.0, 0.0, -self.load), levels=2, settle_seconds=self.settle_seconds)
+    def _moved(self, name: str, stiffness: tuple[float, ...], wrong: bool = False) -> tuple[list[float], torch.Tensor]:
+        """Downward displacements under the load at these stiffnesses, and where (3,) a hand is without one [m].
+
+        Pelvis fixed; the stiffness of the hand without a load is the last.
+        """
+        protocol = StaticStiffness(force=(0.0, 0.0, -self.load), levels=1 + len(stiffness))
         cfg = protocol.configure(H1EnvConfig(num_threads=self.threads))
-        cfg.upper_body = laws_of(name, stiffness).configure()
+        cfg.force.start_s = self.settle_seconds
+        cfg.upper_body = laws_of(name, stiffness[-1]).configure()
         env = H1Env(cfg)
         if wrong:
             misjudge(env, self.wrong_length, self.wrong_mass)
-        moved = -float(measure(env, protocol, None).displacement[-1, 2])
-        return moved, env.state.arms.tip[0, 0].clone()
+        env.upper_body.parameters.stiffness[:-1] = torch.tensor(stiffness)[:, None, None]
+        env.scripted.amplitude_h[-1] = 0.0
+        env.motions.hold(mirrored_pose(env, protocol.arm_pose))
+        moved = settle(env, None, self.settle_seconds, 0, False).moved[:-1, 2]
+        return (-moved).tolist(), env.state.arms.tip[-1, 0].clone()
 
     def table(self, result: dict[str, Any]) -> str:
         """As Markdown: Table I in figures, and what the stability column sums up."""
