@@ -204,8 +204,8 @@ def test_rubbish_and_absence_are_told_apart(tmp_path):
 
 
 def test_one_command_times_inference_without_torch(policy_file, tmp_path, capsys):
-    code = "import sys; sys.modules['torch'] = None; from cotap.deployment.policy import main; sys.exit(main(sys.argv[1:]))"
-    found = subprocess.run([sys.executable, "-c", code, str(policy_file)], capture_output=True, text=True, timeout=60)
+    code = "import sys; sys.modules['torch'] = None; from cotap.deployment.policy import main; sys.exit(main())"
+    found = subprocess.run([sys.executable, "-c", code, str(policy_file)], capture_output=True, text=True)
     assert found.returncode == 0, found.stderr
     median, late = (float(v) for v in re.findall(r"([\d.]+) ms", found.stdout))
     assert 0.0 < median <= late
