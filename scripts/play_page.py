@@ -18,17 +18,14 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import tyro
 
 from cotap.checks import require_one_of, require_range
-
-if TYPE_CHECKING:
-    from PIL.Image import Image
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 ARGUMENTS = [
@@ -38,6 +35,8 @@ ARGUMENTS = [
 STATUS = "control steps/s"
 """What the head of the page says once everything runs."""
 PATIENCE_S = 180.0
+DRAWN_MS = 150.0
+"""How long a step takes to be seen in the browser [ms]."""
 
 
 @contextlib.contextmanager
@@ -151,6 +150,15 @@ def _shown_time_after(page: Any, seconds: float) -> tuple[float, float]:
     return _shown_time(page)
 
 
+def _until(page: Any, happened: Callable[[], bool]) -> None:
+    """Wait for the simulation to have taken what the page sent. Raises ValueError if it never does."""
+    deadline = time.monotonic() + PATIENCE_S
+    while not happened():
+        if time.monotonic() > deadline:
+            raise ValueError("the simulation does not take what the page sends")
+        page.wait_for_timeout(20)
+
+
 def _status(page: Any) -> float:
     text = page.get_by_text(STATUS).inner_text()
     found = re.search(r"([\d.]+) s", text)
@@ -179,15 +187,15 @@ class Film:
     """Of the page [pixels]."""
     scale: float = 0.65
     """Of the recording's size over the page's."""
-    speed: float = 0.1
-    """Of the simulation over real time while it is filmed; the recording plays in real time."""
+    fps: float = 12.5
+    """Pictures per second of simulated time; the page waits for each, so that no machine is too slow."""
     seed: int = 0
     """Seed of the robots' start."""
 
     def run(self) -> str:
         """Film. Returns lines to print."""
         require_range("scale", self.scale, 0.1, 1.0)
-        require_range("speed", self.speed, 0.1, 4.0)
+        require_range("fps", self.fps, 1.0, 50.0)
         require_range("force", self.force, 5.0, 300.0)
         for path in filter(None, (self.output, self.picture)):
             if not Path(path).resolve().parent.is_dir():
@@ -202,6 +210,7 @@ class Film:
         server = open_server("127.0.0.1", port)
         with tempfile.TemporaryDirectory() as folder:
             app = App(server, Session({"cotap": default_checkpoint()}, self.seed), Path(folder))
+            server.initial_camera.position, server.initial_camera.look_at = (2.1, 1.4, 1.4), (0.0, 0.5, 0.85)
             thread = threading.Thread(target=app.run, daemon=True)
             thread.start()
             try:
@@ -210,34 +219,46 @@ class Film:
                     page = browser.new_context(viewport=view).new_page()
                     page.goto(f"http://127.0.0.1:{port}")
                     page.get_by_text(STATUS).wait_for(timeout=1000.0 * PATIENCE_S)
-                    frames = self._scenes(page, app)
+                    pictures = self._scenes(page, app)
             finally:
                 app.stop()
                 thread.join(10.0)
                 server.stop()
-        return self._write(frames)
+        return self._write(pictures)
 
-    def _scenes(self, page: Any, app: Any) -> list[tuple[float, bytes]]:
-        """Screenshots with the simulated time of each [s]."""
-        frames: list[tuple[float, bytes]] = []
+    def _scenes(self, page: Any, app: Any) -> list[bytes]:
+        """Screenshots, `fps` for every second of simulated time."""
+        from cotap.play.mailbox import Step
+
+        pictures: list[bytes] = []
+        stride = max(1, round(1.0 / (self.fps * app.session.dt)))
 
         def shoot(seconds: float) -> None:
-            until = app.session.num_steps * app.session.dt + seconds
-            while (now := app.session.num_steps * app.session.dt) < until:
-                frames.append((now, page.screenshot()))
+            for _ in range(round(seconds * self.fps)):
+                for _ in range(stride):
+                    before = app.session.num_steps
+                    app.mailbox.ask(Step())
+                    while app.session.num_steps == before:
+                        time.sleep(0.005)
+                page.wait_for_timeout(DRAWN_MS)
+                pictures.append(page.screenshot())
 
         def set_stiffness(value: float) -> None:
             page.get_by_role("tab", name="Arms").click()
             for axis in "xyz":
                 fill(page, f"K_ee {axis} [N/m]", value)
+                _until(page, lambda axis=axis: app.session.values[f"a.left.stiffness_{axis}"] == value)
 
         def push() -> None:
             page.get_by_role("tab", name="Push").click()
             fill(page, "force [N]", self.force)
             page.get_by_role("button", name="Push forward", exact=True).click()
 
+        for notice in page.get_by_role("alert").all():  # of drawing without a graphics card
+            notice.get_by_role("button").click()
         page.get_by_label("policy moves arms").click()  # the law alone
-        fill(page, "speed", self.speed)
+        page.get_by_label("paused").click()
+        _until(page, lambda: app.session.values["paused"])
         set_stiffness(self.soft)
         shoot(0.6)
         push()
@@ -249,37 +270,36 @@ class Film:
         if self.picture:
             from cotap.agents.checkpoint import write_atomically
 
-            write_atomically(Path(self.picture), lambda p: p.write_bytes(frames[-1][1]))
+            write_atomically(Path(self.picture), lambda p: p.write_bytes(pictures[-1]))
         shoot(1.2)
-        return frames
+        return pictures
 
-    def _write(self, frames: list[tuple[float, bytes]]) -> str:
+    def _write(self, pictures: list[bytes]) -> str:
         from PIL import Image
 
         from cotap.agents.checkpoint import write_atomically
 
         size = (round(self.width * self.scale), round(self.height * self.scale))
-        times = [now for now, _ in frames]
-        images: list[Image] = []
-        lengths: list[int] = []
-        for i, (now, data) in enumerate(frames):
-            until = times[i + 1] if i + 1 < len(frames) else now + 0.5
-            # Two pictures of one moment: the newer one counts.
-            if until - now < 1e-6:
-                continue
-            images.append(Image.open(io.BytesIO(data)).convert("RGB").resize(size, Image.Resampling.LANCZOS))
-            lengths.append(max(20, round(1000.0 * (until - now))))
+        images = [
+            Image.open(io.BytesIO(data)).convert("RGB").resize(size, Image.Resampling.LANCZOS) for data in pictures
+        ]
         kind = Path(self.output).suffix[1:]
         options: dict[str, Any] = {"quality": 55, "method": 4, "minimize_size": True} if kind == "webp" else {}
 
         def save(path: Path) -> None:
             images[0].save(
-                path, format=kind, save_all=True, append_images=images[1:], duration=lengths, loop=0, **options
+                path,
+                format=kind,
+                save_all=True,
+                append_images=images[1:],
+                duration=round(1000.0 / self.fps),
+                loop=0,
+                **options,
             )
 
         write_atomically(Path(self.output), save)
         size_mb = Path(self.output).stat().st_size / 1e6
-        return f"{self.output}: {len(images)} pictures, {sum(lengths) / 1000.0:.1f} s, {size_mb:.2f} MB"
+        return f"{self.output}: {len(images)} pictures, {len(images) / self.fps:.1f} s, {size_mb:.2f} MB"
 
 
 COMMANDS = {"speed": Speed, "film": Film}

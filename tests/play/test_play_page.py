@@ -16,7 +16,7 @@ import play_page
     ("arguments", "message"),
     [(["dance"], "command 'dance' is unknown"), (["speed", "--viewers", "0"], "viewers must lie in"),
      (["film", "--output", "no/such/play.webp"], "'no/such/play.webp': its folder does not exist"),
-     (["film", "--output", "play.mp3"], "suffix '.mp3' is unknown"), (["film", "--speed", "0"], "speed must lie in"),
+     (["film", "--output", "play.mp3"], "suffix '.mp3' is unknown"), (["film", "--fps", "0"], "fps must lie in"),
      (["speed"], "no browser")],
 )  # fmt: skip
 def test_bad_input_is_named(arguments, message, capsys, monkeypatch):
@@ -31,10 +31,10 @@ def test_a_small_film(tmp_path, capsys):
     from PIL import Image
 
     film, still = tmp_path / "play.webp", tmp_path / "play.png"
-    arguments = ["film", "--output", str(film), "--picture", str(still), "--scale", "0.2", "--speed", "1"]
+    arguments = ["film", "--output", str(film), "--picture", str(still), "--scale", "0.2", "--fps", "2"]
     assert play_page.main(arguments) == 0
     with Image.open(film) as moving:
-        assert moving.n_frames > 3
+        assert moving.n_frames == 9
         assert moving.size == (220, 140)
     with Image.open(still) as picture:
         assert picture.size == (1100, 700)
