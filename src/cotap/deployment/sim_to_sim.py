@@ -143,7 +143,8 @@ def _parts(policy: OnnxPolicy, cfg: Comparison, run: Run) -> dict[str, Callable[
 
 def _keep(path: Path | None, about: dict[str, Any], measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     """What `measure` returns; from `path` if it is there and about the same."""
-    about = json.loads(json.dumps(about))
+    # What is run in one engine does not depend on which others there are.
+    about = json.loads(json.dumps({name: value for name, value in about.items() if name != "engines"}))
     if path and path.is_file():
         with contextlib.suppress(ValueError):  # not JSON: run it again
             before = json.loads(path.read_text(encoding="utf-8"))
