@@ -167,7 +167,7 @@ class Transient:
     checkpoint: str = ""
     """Policy of the legs; by default the shipped CoTaP policy."""
     forces: tuple[float, ...] = (200.0, 500.0)
-    """Along x on the left hand, for 50 ms [N]. The smaller leaves H1's arms below their torque limits."""
+    """Along x on the left hand, for 50 ms [N]. The smaller leaves arms under PD and CoTaP below their torque limits."""
     stiffness: float = 500.0
     """Of the hand, along all axes [N/m]."""
     num_envs: int = 64
