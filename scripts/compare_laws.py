@@ -1,12 +1,16 @@
-"""Every law of the arms side by side: static errors as in the paper's Table VI, and what backs its Table I.
+"""Every law of the arms side by side: the paper's Table VI and Fig. 9, and what backs its Table I.
 
-python scripts/compare_laws.py static --pelvis free --repeats 64 --json static.json
-python scripts/compare_laws.py properties --json properties.json
+python scripts/compare_laws.py static --pelvis free --repeats 64
+python scripts/compare_laws.py transient --num-envs 256
+python scripts/compare_laws.py properties
+
+Each writes NAME.md, NAME.json and NAME.png into `--output`.
 """
 
 from __future__ import annotations
 
 import sys
+import time
 from contextlib import redirect_stdout
 from dataclasses import dataclass, field
 from io import StringIO
@@ -15,15 +19,21 @@ from typing import Any
 
 import torch
 import tyro
+from law_figures import draw_properties, draw_static, draw_transient
+from paper_tables import PROPERTIES, STATIC
 
-from cotap.agents.checkpoint import write_json
+from cotap.agents.checkpoint import write_atomically, write_json
 from cotap.checks import require_one_of, require_range
+from cotap.compare import difference
 from cotap.configs import to_plain
 from cotap.envs import H1Env, H1EnvConfig
-from cotap.evaluate import StaticStiffnessOptions, static_stiffness
+from cotap.evaluate import ImpactOptions, StaticStiffnessOptions, scenario, static_stiffness
+from cotap.evaluation.disturbance import Impact
 from cotap.evaluation.law_options import LawOptions
+from cotap.evaluation.report import save_figure
+from cotap.evaluation.scenario import mirrored_pose
 from cotap.evaluation.stability import Stability, energy_summary, exchanged_energy, growth_rates
-from cotap.evaluation.static import StaticStiffness, measure
+from cotap.evaluation.static import StaticStiffness, settle
 from cotap.evaluation.wrong_model import misjudge
 from cotap.robots import h1
 
@@ -33,6 +43,8 @@ ROWS: dict[str, dict[str, Any]] = {
     "soft-pd": {"method": "soft-pd"},
     "cotap, joint error": {"method": "cotap"},
     "cotap, task error": {"method": "cotap", "error": "task"},
+    "cotap, joint error, critical damping": {"method": "cotap", "damping": "critical"},
+    "cotap, task error, critical damping": {"method": "cotap", "error": "task", "damping": "critical"},
     "facet": {"method": "facet"},
     "cotap+facet, joint error": {"method": "cotap+facet"},
     "cotap+facet, task error": {"method": "cotap+facet", "error": "task"},
@@ -43,20 +55,32 @@ ROWS: dict[str, dict[str, Any]] = {
     "dcc": {"method": "dcc"},
 }
 """Laws by the name of their row."""
+AT_REST = tuple(name for name in ROWS if "damping" not in name)
+"""Rows that differ at rest."""
+STRUCK = (
+    "pd", "facet", "cotap, joint error", "cotap, joint error, critical damping", "cotap, task error, critical damping",
+    "cotap+facet, joint error", "cotap+facet-matched, joint error",
+)  # fmt: skip
+"""Rows that are struck."""
+NULL_STIFFNESS = 25.0
+"""[Nm/rad]."""
+
+
+def laws_of(name: str, stiffness: float, sensing: str = "privileged") -> LawOptions:
+    """The laws of a row."""
+    return LawOptions(stiffness=(stiffness,), null_stiffness=NULL_STIFFNESS, sensing=sensing, **ROWS[name])
 
 
 @dataclass
 class Static:
-    """Downward displacement of the left hand under 10, 30 and 50 N downward, every law."""
+    """Downward displacement of the left hand under 10, 30 and 50 N downward, every law (paper, Table VI)."""
 
     checkpoint: str = ""
-    """Policy of the legs (pelvis free); by default the shipped base policy."""
+    """Policy of the legs (pelvis free); by default the shipped CoTaP policy."""
     pelvis: str = "free"
     """free or fixed."""
     stiffness: float = 500.0
     """Of the hand, along all axes [N/m]."""
-    null_stiffness: float = 25.0
-    """[Nm/rad]."""
     repeats: int = 16
     """Worlds per load."""
     settle_seconds: float = 8.0
@@ -71,32 +95,33 @@ class Static:
     """Processor threads; 0 takes every processor."""
     seed: int = 0
     """Seed of worlds."""
-    laws: tuple[str, ...] = tuple(ROWS)
+    laws: tuple[str, ...] = AT_REST
     """Rows to measure."""
-    json: str = ""
-    """Write the result here."""
+    output: str = "runs/laws"
+    """Folder of what is written."""
 
     def measure(self) -> dict[str, Any]:
         """Downward displacements [m] under the three loads, by row."""
         rows = {}
         for name in self.laws:
-            laws = LawOptions(
-                stiffness=(self.stiffness,), null_stiffness=self.null_stiffness, sensing=self.sensing, **ROWS[name]
-            )
             # 0, 10, ..., 50 N, each in worlds of its own.
             protocol = StaticStiffness(
                 force=(0.0, 0.0, -50.0), pelvis=self.pelvis, levels=6, repeats=self.repeats, seed=self.seed,
                 settle_seconds=self.settle_seconds, arm_actions=self.arm_actions,
                 torque_limit_scale=self.torque_limit_scale,
             )  # fmt: skip
+            laws = laws_of(name, self.stiffness, self.sensing)
             options = StaticStiffnessOptions(
                 checkpoint=self.checkpoint, threads=self.threads, laws=laws, protocol=protocol
             )
             with redirect_stdout(StringIO()):  # its own table
                 result = static_stiffness(options)
-            down = [d[2] for d in result["curve"]["displacement"]]
+            curve = result["curve"]
+            moved = [(_down(curve["displacement"][i]), curve["spread"][i][2]) for i in (1, 3, 5)]
             rows[name] = {
-                "displacement": [None if down[i] is None else -down[i] for i in (1, 3, 5)],
+                "displacement": [m for m, _ in moved],
+                # Of the mean; worlds that fell are few or the mean is none.
+                "half_interval": [1.96 * std / self.repeats**0.5 for _, std in moved],
                 "torque_saturated": result["torque_saturated"],
                 "num_falls": result["num_falls"],
                 "num_envs": result["num_envs"],
@@ -107,15 +132,137 @@ class Static:
 
     def table(self, result: dict[str, Any]) -> str:
         """As Markdown, errors against the ideal in brackets."""
-        lines = [f"| law | {' | '.join(f'{n:g} N' for n in LOADS_N)} | fell |", "|---|---|---|---|---|"]
-        lines.append(f"| ideal | {' | '.join(f'{v:.4f}' for v in result['ideal'])} | |")
+        loads = " | ".join(f"{n:g} N" for n in LOADS_N)
+        lines = [f"| law, displacement [m] | {loads} | torque limit | fell | paper |", "|---|---|---|---|---|---|---|"]
+        lines.append(f"| ideal | {' | '.join(f'{v:.4f}' for v in result['ideal'])} | | | |")
+        near = []
         for name, row in result["rows"].items():
             cells = [
-                "-" if got is None else f"{got:.4f} ({got / ideal - 1.0:+.0%})"
-                for got, ideal in zip(row["displacement"], result["ideal"], strict=True)
+                "-" if got is None else f"{got:.4f} +- {half:.4f} ({got / ideal - 1.0:+.0%})"
+                for got, half, ideal in zip(row["displacement"], row["half_interval"], result["ideal"], strict=True)
             ]
-            lines.append(f"| {name} | {' | '.join(cells)} | {row['num_falls']} of {row['num_envs']} |")
+            paper = " / ".join(f"{v:g}" for v in STATIC[name]) if name in STATIC else ""
+            reached = "reached" if row["torque_saturated"] else ""
+            fell = f"{row['num_falls']} of {row['num_envs']}"
+            lines.append(f"| {name} | {' | '.join(cells)} | {reached} | {fell} | {paper} |")
+            pairs = zip(row["displacement"], result["ideal"], strict=True)
+            if all(got is not None and abs(got / ideal - 1.0) <= 0.1 for got, ideal in pairs):
+                near.append(name)
+        pelvis = f"Pelvis {self.pelvis}, {self.repeats} worlds per load, {self.stiffness:g} N/m."
+        return "\n".join([*lines, "", f"{pelvis} Within 10 % of ideal at all loads: {'; '.join(near) or 'none'}."])
+
+    def draw(self, result: dict[str, Any]) -> Any:
+        """Displacement against load."""
+        return draw_static(result)
+
+
+def _down(displacement: list[float | None]) -> float | None:
+    return None if displacement[2] is None else -displacement[2]
+
+
+@dataclass
+class Transient:
+    """What a hand does after a blow on it, every law (paper, Fig. 9): error over time, energy of its oscillation."""
+
+    checkpoint: str = ""
+    """Policy of the legs; by default the shipped CoTaP policy."""
+    forces: tuple[float, ...] = (200.0, 500.0)
+    """Along x on the left hand, for 50 ms [N]. The smaller leaves arms under PD and CoTaP below their torque limits."""
+    stiffness: float = 500.0
+    """Of the hand, along all axes [N/m]."""
+    num_envs: int = 64
+    """Worlds per law and force."""
+    mode: str = "stance"
+    """stance or walking."""
+    pelvis: str = "free"
+    """free or fixed."""
+    arm_actions: bool = True
+    """Let the policy's own residual move the arms."""
+    torque_limit_scale: float = 1.0
+    """Factor on the robot's torque limits."""
+    threads: int = 0
+    """Processor threads; 0 takes every processor."""
+    seed: int = 0
+    """Seed of worlds."""
+    laws: tuple[str, ...] = STRUCK
+    """Rows to measure."""
+    output: str = "runs/laws"
+    """Folder of what is written."""
+
+    def measure(self) -> dict[str, Any]:
+        """Measures and curves, by force and row."""
+        forces = {}
+        for force in self.forces:
+            rows = forces[f"{force:g}"] = {}
+            for name in self.laws:
+                protocol = Impact(
+                    num_envs=self.num_envs, seed=self.seed, mode=self.mode, pelvis=self.pelvis,
+                    arm_actions=self.arm_actions, torque_limit_scale=self.torque_limit_scale, force=(force, 0.0, 0.0),
+                )  # fmt: skip
+                options = ImpactOptions(
+                    checkpoint=self.checkpoint, threads=self.threads, laws=laws_of(name, self.stiffness),
+                    protocol=protocol,
+                )  # fmt: skip
+                with redirect_stdout(StringIO()):  # its own table
+                    result = scenario("impact", options)
+                kept = ("num_envs", "num_falls", "metrics", "window", "curve")
+                rows[name] = {k: result[k] for k in kept} | {
+                    "checkpoint_sha256": result["settings"]["checkpoint_sha256"]
+                }
+                print(f"  {force:g} N, {name}", file=sys.stderr)
+        return {"forces": forces}
+
+    def table(self, result: dict[str, Any]) -> str:
+        """As Markdown: a table per force, and whether the paper's ordering holds."""
+        lines = []
+        for force, rows in result["forces"].items():
+            lines += [
+                f"**{force} N for 50 ms, {self.mode}, pelvis {self.pelvis}, {self.stiffness:g} N/m**", "",
+                "| law | error of the hand, mean of 1 s [m] | arms at their torque limit "
+                "| energy of the hand's motion [J/kg] | of its oscillation [J/kg] | overshoot | swings | settled [s] "
+                "| fell |",
+                "|---|---|---|---|---|---|---|---|---|",
+            ]  # fmt: skip
+            for name, row in rows.items():
+                shown = [
+                    _cell(row["metrics"][key], digits)
+                    for key, digits in (
+                        ("e_ee_hit", 3), ("share_at_limit", 2), ("transient_energy", 2), ("oscillation_energy", 3),
+                        ("overshoot", 2), ("overshoots", 1), ("settle_s", 2),
+                    )
+                ]  # fmt: skip
+                fell = f"{row['num_falls']} of {row['num_envs']}"
+                lines.append(f"| {name} | {' | '.join(shown)} | {fell} |")
+            lines += ["", *_verdicts(rows), ""]
         return "\n".join(lines)
+
+    def draw(self, result: dict[str, Any]) -> Any:
+        """The hand's displacement along the blow over time."""
+        return draw_transient(result)
+
+
+def _cell(m: dict[str, Any], digits: int) -> str:
+    if m["mean"] is None:
+        return "-"
+    low, high = m["ci95"]
+    return f"{m['mean']:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
+
+
+def _verdicts(rows: dict[str, Any]) -> list[str]:
+    """Of every CoTaP beside FACET: whether its hand oscillates less, as in the paper."""
+    out = []
+    for name in (n for n in rows if n.startswith("cotap, ") and "facet" in rows):
+        d = difference(*(rows[n]["metrics"]["oscillation_energy"] for n in ("facet", name)))
+        if d["difference"] is None:
+            out.append(f"- {name}, oscillation beside facet's: not measured ({d['reason']})")
+            continue
+        low, high = d["ci95"]
+        verdict = "less" if high < 0.0 else "more" if low > 0.0 else "cannot be told apart"
+        out.append(
+            f"- {name}, oscillation beside facet's: **{verdict}**, {d['difference']:+.3f} J/kg "
+            f"({low:+.3f} to {high:+.3f})"
+        )
+    return out
 
 
 @dataclass
@@ -137,19 +284,18 @@ class Properties:
     """Processor threads; 0 takes every processor."""
     laws: tuple[str, ...] = tuple(ROWS)
     """Rows to measure."""
-    json: str = ""
-    """Write the result here."""
+    output: str = "runs/laws"
+    """Folder of what is written."""
 
     def measure(self) -> dict[str, Any]:
         """All of it, by row."""
         self.stability.check()
         rows = {}
         for name in self.laws:
-            soft, _ = self._moved(name, 0.5 * self.stiffness)
-            stiff, _ = self._moved(name, 2.0 * self.stiffness)
-            right, at = self._moved(name, self.stiffness)
-            wrong, misled = self._moved(name, self.stiffness, wrong=True)
-            arms = self._laws(name, self.stiffness).configure()
+            k = self.stiffness
+            (soft, stiff, right), at = self._moved(name, (0.5 * k, 2.0 * k, k))
+            (wrong,), misled = self._moved(name, (k,), wrong=True)
+            arms = laws_of(name, self.stiffness).configure()
             cfg = self.stability.configure(H1EnvConfig(num_threads=self.threads))
             cfg.upper_body = arms
             rows[name] = {
@@ -162,43 +308,77 @@ class Properties:
             print(f"  {name}", file=sys.stderr)
         return {"rows": rows}
 
-    def _laws(self, name: str, stiffness: float) -> LawOptions:
-        return LawOptions(stiffness=(stiffness,), null_stiffness=25.0, **ROWS[name])
+    def _moved(self, name: str, stiffness: tuple[float, ...], wrong: bool = False) -> tuple[list[float], torch.Tensor]:
+        """Downward displacements under the load at these stiffnesses, and where (3,) a hand is without one [m].
 
-    def _moved(self, name: str, stiffness: float, wrong: bool = False) -> tuple[float, torch.Tensor]:
-        """Downward displacement under the load, pelvis fixed, and where (3,) the hand is without one [m]."""
-        protocol = StaticStiffness(force=(0.0, 0.0, -self.load), levels=2, settle_seconds=self.settle_seconds)
+        Pelvis fixed; the stiffness of the hand without a load is the last.
+        """
+        protocol = StaticStiffness(force=(0.0, 0.0, -self.load), levels=1 + len(stiffness))
         cfg = protocol.configure(H1EnvConfig(num_threads=self.threads))
-        cfg.upper_body = self._laws(name, stiffness).configure()
+        cfg.force.start_s = self.settle_seconds
+        cfg.upper_body = laws_of(name, stiffness[-1]).configure()
         env = H1Env(cfg)
         if wrong:
             misjudge(env, self.wrong_length, self.wrong_mass)
-        moved = -float(measure(env, protocol, None).displacement[-1, 2])
-        return moved, env.state.arms.tip[0, 0].clone()
+        env.upper_body.parameters.stiffness[:-1] = torch.tensor(stiffness)[:, None, None]
+        env.scripted.amplitude_h[-1] = 0.0
+        env.motions.hold(mirrored_pose(env, protocol.arm_pose))
+        moved = settle(env, None, self.settle_seconds, 0, False).moved[:-1, 2]
+        return (-moved).tolist(), env.state.arms.tip[-1, 0].clone()
 
     def table(self, result: dict[str, Any]) -> str:
-        """As Markdown."""
+        """As Markdown: Table I in figures, and what the stability column sums up."""
         lines = [
-            f"| law | adjustable: displacement at {self.stiffness / 2:g} over {self.stiffness * 2:g} N/m (ideal 4) "
-            "| wrong model: displacement over the right one's | shift without a load [m] "
-            "| largest real part, free [1/s] | poses unstable, worst wall | trials drawn from "
-            "| the same, stiffness changing |",
-            "|---|---|---|---|---|---|---|---|",
+            f"| law | adjustable: displacement at {self.stiffness / 2:g} over that at {self.stiffness * 2:g} N/m (4 if "
+            "the hand obeys) | model-aware: displacement under a wrong model over that under the right one "
+            "| and where the hand goes without a load [mm] | stable: poses unstable, hand free / worst wall "
+            "| energy drawn, share of trials: stiffness constant / changing | the paper's Table I |",
+            "|---|---|---|---|---|---|---|",
         ]
         for name, row in result["rows"].items():
-            rest = [r for r in row["linearised"] if r["load_rad"] == 0.0]
-            free = next((f"{r['largest_real_part']:+.2f}" for r in rest if r["wall"] == 0.0), "-")
-            worst = max(rest, key=lambda r: r["share_unstable"])
-            constant, changing = row["energy"]["constant_stiffness"], row["energy"]["changing_stiffness"]
+            energy = (row["energy"][f"{k}_stiffness"]["share_drawn"] for k in ("constant", "changing"))
+            shares = [max(part, default=0.0) for part in _shares_unstable(row)]
             lines.append(
                 f"| {name} | {row['softer_over_stiffer']:.2f} | {row['wrong_over_right_displacement']:.2f} "
-                f"| {row['wrong_model_shift']:.4f} | {free} | {worst['share_unstable']:.1%} at {worst['wall']:g} N/m "
-                f"| {constant['share_drawn']:.1%} | {changing['share_drawn']:.1%} |"
+                f"| {1e3 * row['wrong_model_shift']:.1f} | {' / '.join(f'{v:.1%}' for v in shares)} "
+                f"| {' / '.join(f'{v:.1%}' for v in energy)} | {PROPERTIES.get(ROWS[name]['method'], '')} |"
             )
-        return "\n".join(lines)
+        lines += ["", "| law | hand held by [N/m] | joint errors [rad] | largest real part [1/s] | poses unstable |",
+                  "|---|---|---|---|---|"]  # fmt: skip
+        for name, row in result["rows"].items():
+            lines += [
+                f"| {name} | {r['wall']:g} | {r['load_rad']:g} | {r['largest_real_part']:+.2f} "
+                f"| {r['share_unstable']:.1%} |"
+                for r in row["linearised"]
+            ]
+        lines += ["", "| law | stiffness | least energy, mean [J] | least of all [J] | trials drawn from | diverged |",
+                  "|---|---|---|---|---|---|"]  # fmt: skip
+        for name, row in result["rows"].items():
+            for key, e in row["energy"].items():
+                least = " | ".join(
+                    "-" if e[k] is None else f"{e[k]:+.4f}" for k in ("mean_least_energy", "least_energy")
+                )
+                lines.append(
+                    f"| {name} | {key.split('_')[0]} | {least} | {e['share_drawn']:.1%} of {e['trials']} "
+                    f"| {e['num_diverged']} |"
+                )
+        poses = f"{self.stability.poses} poses; a wrong model has links {self.wrong_length:g} times as long"
+        return "\n".join([*lines, "", f"{poses} and {self.wrong_mass:g} times as heavy as they are."])
+
+    def draw(self, result: dict[str, Any]) -> Any:
+        """Bars per law."""
+        return draw_properties(result)
 
 
-TABLES = {"static": Static, "properties": Properties}
+def _shares_unstable(row: dict[str, Any]) -> tuple[list[float], list[float]]:
+    """Of all poses, hand free and hand held."""
+    free, held = [], []
+    for r in row["linearised"]:
+        (held if r["wall"] else free).append(r["share_unstable"])
+    return free, held
+
+
+TABLES = {"static": Static, "transient": Transient, "properties": Properties}
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -216,15 +396,20 @@ def main(argv: list[str] | None = None) -> int:
         require_range("threads", options.threads, 0, 4096)
         if options.threads:
             torch.set_num_threads(options.threads)
-        if options.json and not Path(options.json).resolve().parent.is_dir():
-            raise ValueError(f"--json {options.json!r}: its folder does not exist")
+        output = Path(options.output)
+        output.mkdir(parents=True, exist_ok=True)
+        started = time.perf_counter()
         result = options.measure()
-        if options.json:
-            write_json(Path(options.json), result | {"settings": to_plain(options)})
+        table = options.table(result)
+        seconds = time.perf_counter() - started
+        content = result | {"settings": to_plain(options), "seconds": seconds}
+        write_json(output / f"{args[0]}.json", content)
+        write_atomically(output / f"{args[0]}.md", lambda p: p.write_text(table + "\n", encoding="utf-8"))
+        save_figure(options.draw(result), output / f"{args[0]}.png")
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    print(options.table(result))
+    print(table)
     return 0
 
 

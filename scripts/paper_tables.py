@@ -18,3 +18,14 @@ LOAD = {"K_z 100": "about 0.12 m", "K_z 500": "about 0.05 m", "PD": "about -0.03
 """Fig. 3: hand error in z under -50 N."""
 ABLATION = {"no training": (0.950, 0.252), "without the ratio": (1.008, 0.517), "CoTaP": (0.861, 0.107)}
 """Table IV: e_torso [m/s], e_upper [rad]."""
+STATIC = {
+    "cotap, joint error": (-0.003, -0.015, 0.058),
+    "facet": (0.043, 0.068, 0.106),
+    "cotap+facet, joint error": (0.032, 0.046, 0.097),
+}
+"""Table VI: displacement of the hand in z under 10, 30 and 50 N at 500 N/m [m]."""
+PROPERTIES = {
+    "dcc": "no / yes / no", "pd": "no / no / no (FALCON)", "facet": "yes / no / no", "hmc": "yes / yes / no",
+    "cotap": "yes / yes / yes",
+}  # fmt: skip
+"""Table I: adjustable / model-aware / stability-accounted, by law."""

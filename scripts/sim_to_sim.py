@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from dataclasses import dataclass, field
@@ -18,12 +19,14 @@ from cotap.deployment.sim_to_sim import Comparison, compare, figure, markdown
 
 @dataclass
 class Options:
-    """Velocity tracking, impact, constant and periodic load in every engine; perturbations in the first."""
+    """Velocity tracking, impact, constant and periodic load, perturbations, in every engine."""
 
     policy: str
     """What `python -m cotap.export` wrote."""
     output: str = "runs/sim_to_sim"
-    """Folder for report.md, report.json and report.png."""
+    """Folder for report.md, report.json and report.png; parts/ keeps what is done, and is gone on with."""
+    jobs: int = 0
+    """Processes that share the trials; 0 takes one per processor."""
     comparison: tyro.conf.OmitArgPrefixes[Comparison] = field(default_factory=Comparison)
 
 
@@ -37,10 +40,11 @@ def main(argv: list[str] | None = None) -> int:
         for name in cfg.engines:  # before hours are spent on the others
             make_engine(cfg.engine(name), robot_of(policy.metadata)).close()
         started = time.perf_counter()
-        result = compare(policy, cfg)
-        result["seconds"] = time.perf_counter() - started
         output = Path(options.output)
-        output.mkdir(parents=True, exist_ok=True)
+        (output / "parts").mkdir(parents=True, exist_ok=True)
+        jobs = options.jobs or len(os.sched_getaffinity(0))
+        result = compare(Path(options.policy), cfg, jobs, output / "parts")
+        result["seconds"] = time.perf_counter() - started
         write_json(output / "report.json", result)
         write_atomically(output / "report.md", lambda p: p.write_text(markdown(result), encoding="utf-8"))
         write_atomically(output / "report.png", lambda p: figure(result, p))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import sys
 from pathlib import Path
@@ -13,13 +12,8 @@ import torch
 from cotap.evaluation.wrong_model import misjudged_arms
 from cotap.robots.chains import arm_model
 
-_SPEC = importlib.util.spec_from_file_location(
-    "compare_laws", Path(__file__).parents[1] / "scripts" / "compare_laws.py"
-)
-assert _SPEC is not None
-assert _SPEC.loader is not None
-compare_laws = sys.modules["compare_laws"] = importlib.util.module_from_spec(_SPEC)
-_SPEC.loader.exec_module(compare_laws)
+sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
+import compare_laws
 
 
 def test_a_wrong_model_is_longer_and_heavier(spec):
@@ -31,33 +25,53 @@ def test_a_wrong_model_is_longer_and_heavier(spec):
     assert torch.equal(wrong.inertias.mass[:, 0], right.inertias.mass[:, 0])
 
 
+def small(table: str, folder: Path, *options: str) -> dict:
+    """What a table measures; Markdown and picture are there, too."""
+    assert compare_laws.main([table, "--threads", "1", "--output", str(folder), *options]) == 0
+    assert (folder / f"{table}.png").stat().st_size > 5000
+    return json.loads((folder / f"{table}.json").read_text())
+
+
 def test_static_table(tmp_path, capsys):
-    out = tmp_path / "static.json"
-    arguments = ["static", "--pelvis", "fixed", "--repeats", "1", "--settle-seconds", "2", "--threads", "1", "--json",
-                 str(out), "--laws", "cotap, task error"]  # fmt: skip
-    assert compare_laws.main(arguments) == 0
-    content = json.loads(out.read_text())
+    content = small("static", tmp_path, "--pelvis", "fixed", "--repeats", "1", "--settle-seconds", "2", "--laws",
+                    "cotap, task error", "facet")  # fmt: skip
     assert content["rows"]["cotap, task error"]["displacement"] == pytest.approx(content["ideal"], rel=0.05)
-    assert "| cotap, task error | 0.0" in capsys.readouterr().out
+    text = (tmp_path / "static.md").read_text()
+    assert text in capsys.readouterr().out
+    assert "Within 10 % of ideal at all loads: cotap, task error." in text
+    assert "0.043 / 0.068 / 0.106 |" in text  # the paper's
 
 
-def test_properties_table(tmp_path, capsys):
-    out = tmp_path / "properties.json"
-    arguments = ["properties", "--stability.poses", "4", "--stability.num-envs", "2", "--stability.seconds", "0.2",
-                 "--stability.settle-seconds", "0.5", "--settle-seconds", "2", "--threads", "1", "--json", str(out),
-                 "--laws", "facet"]  # fmt: skip
-    assert compare_laws.main(arguments) == 0
-    row = json.loads(out.read_text())["rows"]["facet"]
+def test_transient_table(tmp_path):
+    """A law that adds no damping to that of PD, and one that is damped critically: the second does not swing."""
+    content = small("transient", tmp_path, "--pelvis", "fixed", "--num-envs", "2", "--forces", "200", "--laws", "facet",
+                    "cotap, task error, critical damping")  # fmt: skip
+    rows = content["forces"]["200"]
+    assert rows["facet"]["metrics"]["overshoots"]["mean"] >= 1.0
+    text = (tmp_path / "transient.md").read_text()
+    assert "cotap, task error, critical damping, oscillation beside facet's: **less**" in text
+
+
+def test_properties_table(tmp_path):
+    content = small("properties", tmp_path, "--stability.poses", "4", "--stability.num-envs", "2",
+                    "--stability.seconds", "0.2", "--stability.settle-seconds", "0.5", "--settle-seconds", "2",
+                    "--laws", "facet")  # fmt: skip
+    row = content["rows"]["facet"]
     assert 1.5 < row["softer_over_stiffer"] < 4.0  # PD's own compliance is in both
     assert row["wrong_over_right_displacement"] != pytest.approx(1.0, abs=1e-3)
-    assert "| facet | " in capsys.readouterr().out
+    text = (tmp_path / "properties.md").read_text()
+    assert "| yes / no / no |" in text  # the paper's
+    assert "| facet | changing | " in text
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [(["statics"], "static"), (["static", "--laws", "jazz"], "jazz"), (["static", "--stiffness", "0"], "stiffness"),
-     (["properties", "--stability.poses", "0"], "poses"), (["static", "--json", "no/such/x.json"], "no/such")],
+     (["properties", "--stability.poses", "0"], "poses"), (["transient", "--num-envs", "0"], "num_envs"),
+     (["static", "--output", "FILE"], "FILE")],
 )  # fmt: skip
-def test_bad_input_is_named(arguments, message, capsys):
-    assert compare_laws.main(arguments) == 2
+def test_bad_input_is_named(arguments, message, capsys, tmp_path):
+    (tmp_path / "FILE").touch()
+    folder = [] if "--output" in arguments else ["--output", str(tmp_path)]
+    assert compare_laws.main([a.replace("FILE", str(tmp_path / "FILE")) for a in arguments] + folder) == 2
     assert message in capsys.readouterr().err

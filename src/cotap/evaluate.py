@@ -395,7 +395,7 @@ def scenario(name: str, options: ScenarioOptions) -> dict[str, Any]:
 def stability(options: StabilityOptions) -> dict[str, Any]:
     """Analyse and measure the left arm's law, print the tables, write what was asked for, and return the result."""
     from cotap.agents.checkpoint import write_json
-    from cotap.evaluation.stability import energy_summary, exchanged_energy, growth_rates, table
+    from cotap.evaluation.stability import energy_summary, exchanged_energy, growth_rates, plot, table
 
     protocol = options.protocol
     env, _, checkpoint = _prepare(options, protocol)
@@ -411,6 +411,8 @@ def stability(options: StabilityOptions) -> dict[str, Any]:
     print(table(result))
     if options.json:
         write_json(Path(options.json), result)
+    if options.plot:
+        plot(Path(options.plot), result)
     return result
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -19,6 +20,7 @@ from cotap.configs import BASE_RECIPES, DISTILL_RECIPES
 from cotap.deployment import graph as graph_module
 from cotap.deployment.metadata import PolicyError
 from cotap.deployment.policy import OnnxPolicy, arm_advance
+from cotap.deployment.policy import main as timing
 from cotap.envs.actions import JointTargets
 from cotap.envs.observations import ObservationHistory, actor_terms
 from cotap.evaluation.policy import load_policy, shipped_checkpoint
@@ -199,3 +201,14 @@ def test_rubbish_and_absence_are_told_apart(tmp_path):
     (tmp_path / "rubbish.onnx").write_bytes(b"not onnx at all")
     with pytest.raises(PolicyError, match="cannot be read as ONNX"):
         OnnxPolicy(tmp_path / "rubbish.onnx")
+
+
+def test_one_command_times_inference_without_torch(policy_file, tmp_path, capsys):
+    code = "import sys; sys.modules['torch'] = None; from cotap.deployment.policy import main; sys.exit(main())"
+    found = subprocess.run([sys.executable, "-c", code, str(policy_file)], capture_output=True, text=True)
+    assert found.returncode == 0, found.stderr
+    median, late = (float(v) for v in re.findall(r"([\d.]+) ms", found.stdout))
+    assert 0.0 < median <= late
+    assert timing([str(tmp_path / "no.onnx")]) == 2
+    assert "does not exist" in capsys.readouterr().err
+    assert timing([]) == 2

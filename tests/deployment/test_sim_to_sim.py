@@ -10,12 +10,17 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+import torch
 
 from cotap.compliance.laws import LawConfig
 from cotap.deployment import sim_to_sim
+from cotap.deployment.engines import EngineConfig
 from cotap.deployment.robot import Perturbations
+from cotap.deployment.safety import SafetyConfig
+from cotap.deployment.scenario import Scenario
 from cotap.deployment.sim_to_sim import Comparison, falls, statics, swing
 from cotap.deployment.trial import Trial
+from cotap.deployment.workers import Workers
 from cotap.envs.upper_body import UpperBodyConfig
 
 SCRIPT = Path(__file__).parents[2] / "scripts" / "sim_to_sim.py"
@@ -64,7 +69,8 @@ def test_a_small_comparison_is_written_whole(policy_file, tmp_path, monkeypatch,
     monkeypatch.setattr(sim_to_sim, "LAWS", {"PD": "pd"})
     monkeypatch.setattr(sim_to_sim, "PERTURBATIONS", {"late": Perturbations(delay_steps=(1, 1))})
     arguments = ["--policy", str(policy_file), "--engines", "mujoco", "--trials", "1", "--perturbed-trials", "1",
-                 "--load-trials", "1", "--seconds", "2", "--timestep", "0.01", "--output", str(tmp_path)]  # fmt: skip
+                 "--load-trials", "1", "--seconds", "2", "--timestep", "0.01", "--jobs", "1", "--output",
+                 str(tmp_path)]  # fmt: skip
     assert script.main(arguments) == 0
     result = json.loads((tmp_path / "report.json").read_text())
     load = result["engines"]["mujoco"]["periodic-load"]["arms"]["right"]
@@ -72,15 +78,36 @@ def test_a_small_comparison_is_written_whole(policy_file, tmp_path, monkeypatch,
     assert result["engines"]["mujoco"]["constant-load"]["PD"]["displacement_z"] < -0.03
     assert "| late | 0 of 1" in (tmp_path / "report.md").read_text()
     assert (tmp_path / "report.png").read_bytes().startswith(b"\x89PNG")
+    # Again, from what was kept; with another seed, anew.
+    monkeypatch.setattr(sim_to_sim, "loads", None)
+    assert script.main(arguments) == 0
+    assert json.loads((tmp_path / "report.json").read_text())["engines"] == result["engines"]
+    with pytest.raises(TypeError):
+        script.main([*arguments, "--seed", "1"])
 
 
-def test_bad_comparisons_are_named(policy_file, script, capsys):
+def test_trials_do_not_depend_on_the_number_of_processes(policy_file):
+    wrong = Perturbations(drop=0.1)
+    options = (UpperBodyConfig(), EngineConfig(timestep=0.01), wrong, SafetyConfig(), Scenario(0.1))
+    found = []
+    for jobs in (1, 2):
+        with Workers(policy_file, jobs) as workers:
+            found.append(workers.trials(options, 3, 5))
+    assert len(found[0]) == 3
+    for one, other in zip(*found, strict=True):
+        assert np.array_equal(one.qpos, other.qpos)
+        torch.testing.assert_close(one.rows, other.rows, rtol=0.0, atol=0.0, equal_nan=True)
+    assert not np.array_equal(found[0][0].qpos, found[0][1].qpos)
+
+
+def test_bad_comparisons_are_named(policy_file, script, capsys, tmp_path):
     for arguments, message in (
         (["--engines", "newton"], "engine 'newton' is unknown"),
         (["--trials", "0"], "trials must be a positive integer"),
         (["--seconds", "1"], "seconds must lie in"),
+        (["--jobs", "-1"], "jobs must lie in"),
     ):
-        assert script.main(["--policy", str(policy_file), *arguments]) == 2
+        assert script.main(["--policy", str(policy_file), "--output", str(tmp_path), *arguments]) == 2
         assert message in capsys.readouterr().err
     with pytest.raises(ValueError, match="at least one engine"):
         Comparison(engines=()).check()

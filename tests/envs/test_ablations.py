@@ -73,6 +73,25 @@ def test_without_the_ratio_stiffness_is_what_alpha_alone_makes_of_it(make_env):
     assert (with_ratio.upper_body._stiffness[1] - expected).abs().max() > 1.0
 
 
+def test_the_threshold_of_the_ratio_is_the_laws_own(make_env):
+    """One that no arm reaches is none; arms of one environment may differ."""
+    far = LawConfig("cotap", alpha=0.6, condition_threshold=1e9)
+    stiffness = []
+    for cfg in (
+        UpperBodyConfig(far, LawConfig("cotap", alpha=0.6)),
+        UpperBodyConfig(far, far, singularity_ratio=False),
+    ):
+        env = make_env(1, upper_body=cfg)
+        env.sim.qpos[:, 7 + 14] = env.sim.qpos[:, 7 + 18] = 1.45
+        env.state = env.reader.read()
+        env.upper_body.send(env.state, env.targets.current[:, 11:])
+        stiffness.append(env.upper_body.stiffness[0])
+    torch.testing.assert_close(stiffness[0][0], stiffness[1][0])
+    assert (stiffness[0][1] - stiffness[1][1]).abs().max() > 1.0
+    with pytest.raises(ValueError, match=r"condition_threshold must lie in \[1.0"):
+        LawConfig("cotap", condition_threshold=0.5).check()
+
+
 @pytest.mark.parametrize("recipe", ["torque-critic", "goals"])
 def test_recipes_of_other_observations_want_a_base_of_their_own(recipe):
     with pytest.raises(ValueError, match=f"base --recipe {recipe}"):

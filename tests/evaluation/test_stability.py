@@ -108,12 +108,12 @@ def test_energy_is_drawn_from_what_is_active_and_from_nothing_else(monkeypatch):
     assert drawn("pushing")["constant_stiffness"]["share_drawn"] > 0.5
     for kind in drawn("soft-pd").values():
         assert kind["share_drawn"] == 0.0
-        assert kind["least_energy"] > -1e-3
+        assert kind["least_energy"] > -1e-4  # however much one hand takes by the waist of what the other gives
 
 
 def test_energy_accounts():
-    """Two worlds of one hand: lacks 0.5 J on the way and gains in the end; has diverged."""
-    energy = torch.tensor([[[0.0], [0.0]], [[-0.5], [0.1]], [[0.7], [-math.inf]]])
+    """Two worlds: lacks 0.5 J on the way and gains in the end; has diverged."""
+    energy = torch.tensor([[0.0, 0.0], [-0.5, 0.1], [0.7, -math.inf]])
     summary = energy_summary(energy)
     assert summary["constant_stiffness"] == {
         "trials": 1, "mean_least_energy": -0.5, "least_energy": -0.5, "share_drawn": 1.0, "num_diverged": 0,
@@ -125,11 +125,13 @@ def test_energy_accounts():
 def test_the_command_prints_and_writes(tmp_path, capsys):
     out = tmp_path / "stability.json"
     arguments = ["stability", "--method", "cotap+facet-matched", "--poses", "4", "--num-envs", "2", "--seconds", "0.2",
-                 "--settle-seconds", "0.2", "--threads", "1", "--json", str(out)]  # fmt: skip
+                 "--settle-seconds", "0.2", "--threads", "1", "--json", str(out),
+                 "--plot", str(tmp_path / "stability.png")]  # fmt: skip
     assert main(arguments) == 0
     content = json.loads(out.read_text())
     assert len(content["linearised"]) == 8
-    assert content["energy"]["changing_stiffness"]["trials"] == 2
+    assert content["energy"]["changing_stiffness"]["trials"] == 1
+    assert (tmp_path / "stability.png").stat().st_size > 5000
     assert "largest real part" in capsys.readouterr().out
 
 

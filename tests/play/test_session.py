@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from cotap.evaluation.policy import shipped_checkpoint
 from cotap.play.forces import Push
 from cotap.play.sample import effective_stiffness
+from cotap.play.session import Session
 
 LEFT, RIGHT = 0, 1
 
@@ -118,3 +120,15 @@ def test_along_a_straight_arm_the_effective_stiffness_is_finite():
     stiffness = effective_stiffness(jacobian, 100.0 * torch.eye(4))
     assert torch.isfinite(stiffness).all()
     assert float(stiffness[2, 2]) == pytest.approx(1e6, rel=1e-3)
+
+
+def test_stiffness_stays_what_was_set_under_a_policy_that_was_trained_with_all():
+    """Its training draws parameters of laws at every start, and again within episodes."""
+    session = Session({"cotap": shipped_checkpoint("cotap")})
+    assert session.set({"a.left.stiffness_x": 1200.0, "b.right.alpha": 0.25}) == []
+    session.reset()
+    for _ in range(2):
+        session.step()
+    parameters = session.env.upper_body.parameters
+    assert parameters.stiffness[:, :, 0].tolist() == [[1200.0, 300.0], [300.0, 300.0]]
+    assert parameters.alpha.tolist() == [[1.0, 1.0], [1.0, 0.25]]

@@ -33,6 +33,8 @@ class LawConfig:
     alpha: float = 1.0
     """Share of compliance in its blend with PD: 1 all compliance, 0 all PD. Of stiffness and with gravity compensation
     under cotap, of torques under hmc."""
+    condition_threshold: float = 10.0
+    """Condition number of the hand's Jacobian above which compliance gives way to PD (cotap; paper, equation 10)."""
     error: str = "joint"
     """joint: stiffness acts on joint errors (the paper). task: on the hand's, exact at any displacement (cotap)."""
     damping: str = "pd"
@@ -58,6 +60,7 @@ class LawConfig:
             require_range(f"{where}.stiffness[{i}]", value, 1.0, 1e5)
         require_range(f"{where}.null_stiffness", self.null_stiffness, 0.1, 1e4)
         require_range(f"{where}.alpha", self.alpha, 0.0, 1.0)
+        require_range(f"{where}.condition_threshold", self.condition_threshold, 1.0, 1e9)
         require_range(f"{where}.soft_gain", self.soft_gain, 0.1, 1e4)
         require_range(f"{where}.virtual_mass", self.virtual_mass, 0.01, 1e3)
         require_range(f"{where}.damping_ratio", self.damping_ratio, 0.01, 100.0)
@@ -112,7 +115,9 @@ class CoTaPLaw:
         jacobian_h = state.to_heading.unsqueeze(1) @ self._arms.chains.jacobian(state.pose)
         felt, projected = _arm_stiffness(parameters.stiffness, state.base_compliance_h)
         pd = self._arms.kp[:, 0].expand(n, -1)
-        blend = blended_stiffness(jacobian_h, felt, parameters.null_stiffness, pd, parameters.alpha)
+        blend = blended_stiffness(
+            jacobian_h, felt, parameters.null_stiffness, pd, parameters.alpha, self._cfg.condition_threshold
+        )
         error = state.target - state.position
         if self._cfg.error == "task":
             error = self._task_error(state, blend, error)

@@ -76,6 +76,9 @@ class MujocoEngine:
         """As `Engine.close`."""
 
     def _push(self, force_w: np.ndarray) -> None:
+        if not force_w.any():
+            self.data.xfrc_applied[:] = 0.0
+            return
         mujoco.mj_kinematics(self.model, self.data)
         for (body, lever), force in zip(self._hands, force_w, strict=True):
             # MuJoCo takes a wrench at the centre of mass.

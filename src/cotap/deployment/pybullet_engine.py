@@ -74,7 +74,8 @@ class PybulletEngine:
         self._bullet.resetBaseVelocity(self._robot, qvel[:3] + np.cross(angular_w, lever), angular_w)
         for link, q, dq in zip(self._joints, qpos[7:], qvel[6:], strict=True):
             self._bullet.resetJointState(self._robot, link, q, dq)
-        self._read_state()
+        self._read_joints()
+        self._read_base()
         self._read_feet()
 
     def hold(self, held: bool) -> None:
@@ -101,7 +102,8 @@ class PybulletEngine:
             if hand_force_w.any():
                 self._push(hand_force_w)
             self._bullet.stepSimulation()
-            self._read_state()
+            self._read_joints()
+        self._read_base()
         self._read_feet()
 
     def close(self) -> None:
@@ -150,13 +152,15 @@ class PybulletEngine:
         state = self._bullet.getLinkState(self._robot, self._links[body], computeForwardKinematics=1)
         return np.array(state[4]), Rotation.from_quat(state[5])
 
-    def _read_state(self) -> None:
+    def _read_base(self) -> None:
         position, attitude = self._bullet.getBasePositionAndOrientation(self._robot)
         linear, angular = (np.array(v) for v in self._bullet.getBaseVelocity(self._robot))
         base = Rotation.from_quat(attitude) * self._com_rotation.inv()
         lever = base.apply(self._com)
         self.qpos[:3], self.qpos[3:7] = position - lever, base.as_quat(scalar_first=True)
         self.qvel[:3], self.qvel[3:6] = linear - np.cross(angular, lever), base.inv().apply(angular)
+
+    def _read_joints(self) -> None:
         states = self._bullet.getJointStates(self._robot, self._joints)
         self.qpos[7:], self.qvel[6:] = [s[0] for s in states], [s[1] for s in states]
 

@@ -77,6 +77,7 @@ class Robot:
         self._rng = np.random.default_rng()
         self._queue: deque[JointLaw] = deque()
         self._lost: Readings | None = None
+        self._truth: RobotState | None = None  # read once per control step
 
     def start(self, joints: np.ndarray, seed: int) -> None:
         """Stand at `joints` (J,) [rad], but for the perturbations, motors holding it there."""
@@ -94,6 +95,7 @@ class Robot:
     def place(self, qpos: np.ndarray, qvel: np.ndarray, mass_scale: float = 1.0, delay: int = 0) -> None:
         """Put the robot into a state, motors holding its joints there, with laws that arrive `delay` steps late."""
         self.engine.reset(qpos, qvel, mass_scale)
+        self._truth = None
         self._queue = deque([self.holding(qpos[7:])] * (1 + delay))
         self._lost = None
 
@@ -108,7 +110,9 @@ class Robot:
 
     def truth(self) -> RobotState:
         """The state as it is: for measures and for the forces of the world, never for the controller."""
-        return self._reader.read()
+        if self._truth is None:
+            self._truth = self._reader.read()
+        return self._truth
 
     def torque(self) -> np.ndarray:
         """(J,) what the motors give now, limits included [Nm]."""
@@ -120,7 +124,8 @@ class Robot:
         truth = self.truth()
         q = truth.joint_pos + self._noise(self.cfg.encoder_noise, truth.joint_pos)
         dq = truth.joint_vel + self._noise(self.cfg.velocity_noise, truth.joint_vel)
-        arms = self._reader.arm_chains.pose(self._reader.arm_joints(q))
+        noisy = self.cfg.encoder_noise > 0.0
+        arms = self._reader.arm_chains.pose(self._reader.arm_joints(q)) if noisy else truth.arms
         readings = Readings(measured(truth, joint_pos=q, joint_vel=dq, arms=arms), self.torque())
         if self._lost is not None and self._rng.random() < self.cfg.drop:
             return self._lost
@@ -141,6 +146,7 @@ class Robot:
         self._queue.popleft()
         heading = self.truth().heading_w[0].numpy()
         self.engine.advance(self._queue[0], self.steps, hand_force_h @ heading.T)
+        self._truth = None
 
     def _noise(self, width: float, like: torch.Tensor) -> torch.Tensor:
         return (

@@ -5,14 +5,18 @@ The paper's section IV-C, with predictions beside what was measured where static
 
 from __future__ import annotations
 
+import contextlib
+import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
+from cotap.agents.checkpoint import write_json
 from cotap.checks import require_positive_int, require_range
 from cotap.compliance.laws import LawConfig
 from cotap.configs import to_plain
@@ -23,7 +27,7 @@ from cotap.deployment.robot import Perturbations
 from cotap.deployment.safety import SafetyConfig
 from cotap.deployment.scenario import Scenario, TimedCommand
 from cotap.deployment.trial import Trial, trajectory
-from cotap.deployment.trials import run_trials
+from cotap.deployment.workers import Workers
 from cotap.envs import H1EnvConfig
 from cotap.envs.forces import ForceProfile
 from cotap.envs.state import StateReader
@@ -62,7 +66,7 @@ class Comparison:
     trials: int = 100
     """Trials of velocity tracking."""
     perturbed_trials: int = 20
-    """Trials of each perturbation; the first engine only."""
+    """Trials of each perturbation."""
     load_trials: int = 4
     """Trials of each law under each load."""
     seconds: float = 20.0
@@ -90,34 +94,65 @@ class Comparison:
 Run = Callable[..., list[Trial]]
 
 
-def compare(policy: OnnxPolicy, cfg: Comparison) -> dict[str, Any]:
-    """Run everything. Returns what the report is written from."""
-    spec, result = robot_of(policy.metadata), {"settings": to_plain(cfg), "engines": {}}
-    result["dt"] = policy.metadata.control_dt
-    result["settings"]["checkpoint_sha256"] = policy.metadata.checkpoint_sha256
-    for name in cfg.engines:
-        engine = cfg.engine(name)
+def compare(path: Path, cfg: Comparison, jobs: int = 1, kept: Path | None = None) -> dict[str, Any]:
+    """Run everything. Returns what the report is written from; it does not depend on `jobs`.
 
-        def run(
-            scenario: Scenario, count: int, laws: UpperBodyConfig | None = None, wrong: Perturbations | None = None,
-            engine: EngineConfig = engine,
-        ) -> list[Trial]:  # fmt: skip
-            return run_trials(
-                policy, laws or law_config(policy.metadata), engine, wrong or Perturbations(), SafetyConfig(), scenario,
-                count, cfg.seed,
-            )  # fmt: skip
+    Args:
+        path: The policy.
+        cfg: What is run.
+        jobs: How many processes share the trials.
+        kept: Folder in which parts that are done are kept, and found again if they were run with the same settings.
+    """
+    policy = OnnxPolicy(path)
+    about = to_plain(cfg) | {"checkpoint_sha256": policy.metadata.checkpoint_sha256}
+    result: dict[str, Any] = {"settings": about, "dt": policy.metadata.control_dt, "engines": {}}
+    with Workers(path, jobs) as workers:
+        for name in cfg.engines:
+            engine, done = cfg.engine(name), result["engines"].setdefault(name, {})
 
-        result["engines"][name] = {
-            "velocity-tracking": tracking(run(Scenario(cfg.seconds), cfg.trials), policy, cfg),
-            "impact": loads(run, spec, Impact(onset=ONSET_S, episode_seconds=ONSET_S + 2.0), cfg),
-            "constant-load": loads(run, spec, ConstantLoad(onset=ONSET_S, episode_seconds=ONSET_S + 4.0), cfg),
-            "periodic-load": periodic(run, spec, cfg),
-        }
-        if name == cfg.engines[0]:
-            result["perturbations"] = {
-                label: falls(run(Scenario(cfg.seconds), cfg.perturbed_trials, wrong=wrong))
-                for label, wrong in PERTURBATIONS.items()
-            }
+            def run(
+                scenario: Scenario, count: int, laws: UpperBodyConfig | None = None,
+                wrong: Perturbations | None = None, engine: EngineConfig = engine,
+            ) -> list[Trial]:  # fmt: skip
+                laws = laws or law_config(policy.metadata)
+                return workers.trials(
+                    (laws, engine, wrong or Perturbations(), SafetyConfig(), scenario), count, cfg.seed
+                )
+
+            for part, measure in _parts(policy, cfg, run).items():
+                done[part] = _keep(kept / f"{name}-{part}.json" if kept else None, about, measure)
+    return result
+
+
+def _parts(policy: OnnxPolicy, cfg: Comparison, run: Run) -> dict[str, Callable[[], dict[str, Any]]]:
+    """Everything that is run in one engine, by name."""
+    spec = robot_of(policy.metadata)
+    blow, load = Impact(onset=ONSET_S, episode_seconds=ONSET_S + 2.0), ConstantLoad(onset=ONSET_S)
+    load.episode_seconds = ONSET_S + 4.0
+    return {
+        "velocity-tracking": lambda: tracking(run(Scenario(cfg.seconds), cfg.trials), policy, cfg),
+        "impact": lambda: loads(run, spec, blow, cfg),
+        "constant-load": lambda: loads(run, spec, load, cfg),
+        "periodic-load": lambda: periodic(run, spec, cfg),
+        "perturbations": lambda: {
+            label: falls(run(Scenario(cfg.seconds), cfg.perturbed_trials, wrong=wrong))
+            for label, wrong in PERTURBATIONS.items()
+        },
+    }
+
+
+def _keep(path: Path | None, about: dict[str, Any], measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """What `measure` returns; from `path` if it is there and about the same."""
+    # What is run in one engine does not depend on which others there are.
+    about = json.loads(json.dumps({name: value for name, value in about.items() if name != "engines"}))
+    if path and path.is_file():
+        with contextlib.suppress(ValueError):  # not JSON: run it again
+            before = json.loads(path.read_text(encoding="utf-8"))
+            if before.get("about") == about:
+                return before["result"]
+    result = measure()
+    if path:
+        write_json(path, {"about": about, "result": result})
     return result
 
 
@@ -246,8 +281,10 @@ def markdown(result: dict[str, Any]) -> str:
                 arm[k] for k in ("elbow_torque_nm", "elbow_torque_statics_nm", "hand_swing_m", "hand_swing_statics_m")
             )
             lines.append(f"| {name} | {side} | " + " | ".join("-" if v is None else f"{v:.3f}" for v in cells) + " |")
-    lines += ["", f"## Perturbations, {next(iter(engines))}", "", "| what is wrong | fell |", "|---|---|"]
-    lines += [f"| {label} | {_falls(row)} |" for label, row in result["perturbations"].items()]
+    lines += ["", "## Perturbations", "", "| what is wrong, fell | " + " | ".join(engines) + " |"]
+    lines.append("|---" * (len(engines) + 1) + "|")
+    for label in next(iter(engines.values()))["perturbations"]:
+        lines.append(f"| {label} | " + " | ".join(_falls(e["perturbations"][label]) for e in engines.values()) + " |")
     return "\n".join(lines) + "\n"
 
 

@@ -58,6 +58,7 @@ def start_up(robot: Robot, controller: Controller, safety: SafetyConfig, seed: i
     robot.engine.hold(False)
 
 
+@torch.inference_mode()
 def run_trial(
     robot: Robot, controller: Controller, scenario: Scenario, safety: SafetyConfig, seed: int = 0,
     pilot: Pilot | None = None,

@@ -9,7 +9,6 @@ from typing import Any
 import torch
 
 from cotap.checks import require_interval, require_one_of, require_range
-from cotap.compliance import singularity_aware_ratio
 from cotap.compliance.interface import ArmState, LawParameters, Remembering, TorqueLaw, UpperBodyLaw
 from cotap.compliance.laws import LAWS, LawConfig
 from cotap.compliance.torso import chain_compliance, hand_base_compliance, torso_compliance
@@ -278,28 +277,22 @@ class UpperBody(Stateful):
             self._damping[which],
         )
 
-    def _undiminished(self, arms: ArmState) -> LawParameters:
-        """The parameters, alpha raised by what the laws will take off it for a singularity."""
-        one = torch.ones_like(self.parameters.alpha, dtype=torch.float64)
-        left = singularity_aware_ratio(one, self.arms.chains.jacobian(arms.pose).double())
-        return replace(self.parameters, alpha=(self.parameters.alpha / left).float())
-
     def _mask(self, law: LawConfig) -> torch.Tensor:
         """The arms (N, A) under laws of one kind, to write to; none at first."""
         kind = law.kind()
         if kind not in self._laws:
             nobody = torch.zeros(self._shape[:2], dtype=torch.bool)
-            self._laws[kind] = (LAWS[law.name](self.arms, law), law, nobody)
+            built = law if self._cfg.singularity_ratio else replace(law, condition_threshold=math.inf)
+            self._laws[kind] = (LAWS[law.name](self.arms, built), law, nobody)
         return self._laws[kind][2]
 
     def _ask(self, arms: ArmState) -> tuple[TorqueLaw, dict[str, torch.Tensor]]:
         """Every law for all arms; each arm keeps its own's answer."""
         merged: TorqueLaw | None = None
         log: dict[str, torch.Tensor] = {}
-        parameters = self.parameters if self._cfg.singularity_ratio else self._undiminished(arms)
         for law, config, mine in self._laws.values():
             force = self.sensors.estimated if config.sensing == "estimated" else self.sensors.privileged
-            answer, report = law(replace(arms, hand_force_h=force), parameters)
+            answer, report = law(replace(arms, hand_force_h=force), self.parameters)
             log.update({f"/law/{k}": v[mine].mean() for k, v in report.values.items()})
             merged = answer if merged is None else _choose(mine, answer, merged)
         assert merged is not None

@@ -16,6 +16,7 @@ from cotap.evaluation.metrics import masked_mean, summaries
 from cotap.evaluation.report import save_figure
 from cotap.evaluation.rollout import Trajectory
 from cotap.evaluation.scenario import Scenario
+from cotap.evaluation.transient import back_within, transient_measures
 
 BEFORE_S = 0.5
 """What a hand does in this time before the onset is what it is compared with afterwards [s]."""
@@ -80,6 +81,9 @@ class Impact(Scenario):
         window = window_measures(t, begin, end, hit)
         if any(self.force):
             window |= response_measures(t, onset, begin, end, hit)
+        release = onset + round(self.duration / t.dt)
+        if any(self.force) and release < end:
+            window |= transient_measures(t, onset, release, end, hit, BEFORE_S)
         episode = window_measures(t, 0, len(t.fell), hit)
         return {
             "falls": falls_by_time(t, onset, end),
@@ -208,11 +212,7 @@ def recovery(error: torch.Tensor, alive: torch.Tensor, onset: int, dt: float) ->
         and whether (N,) the robot stands and the error is back, or never left, by the record's end.
     """
     before = error[onset - round(BEFORE_S / dt) : onset].mean(0)
-    over = error[onset:] > 1.5 * before
-    left = over.any(0)
-    last = torch.where(over, torch.arange(over.shape[0]).unsqueeze(1), -1).amax(0)
-    back = (last < over.shape[0] - 1) & alive.all(0)
-    return torch.where(back & left, (last + 1).float() * dt, torch.full_like(before, math.nan)), back
+    return back_within(error, 1.5 * before, alive, onset, dt)
 
 
 def falls_by_time(t: Trajectory, onset: int, end: int) -> dict[str, int]:
@@ -223,17 +223,22 @@ def falls_by_time(t: Trajectory, onset: int, end: int) -> dict[str, int]:
 
 
 def curve(t: Trajectory, onset: int, hit: list[int]) -> dict[str, list[float]]:
-    """Mean over standing worlds of what happens over time, from up to a second before the onset."""
+    """Mean over standing worlds of what happens over time, from up to a second before the onset.
+
+    Displacements are relative to the last step before it; `_std` is their standard deviation over worlds.
+    """
     begin = max(0, onset - round(1.0 / t.dt))
     stood = ~t.fell.any(0)
     if not stood.any():
         return {"time": []}
-    offset = t.hand_offset[begin:, stood][:, :, hit].mean((1, 2))
+    offset = t.hand_offset[begin:, stood][:, :, hit].mean(2)
+    moved = offset - offset[onset - 1 - begin]
     velocity = (t.velocity - t.command)[begin:, stood]
     rows = {
         "time": (torch.arange(begin, len(t.fell)) - onset + 1) * t.dt,
         "hand_error": t.hand_error[begin:, stood][..., hit].mean((1, 2)),
-        **{f"hand_displacement_{axis}": offset[:, i] - offset[onset - 1 - begin, i] for i, axis in enumerate("xyz")},
+        **{f"hand_displacement_{axis}": moved[..., i].mean(1) for i, axis in enumerate("xyz")},
+        **{f"hand_displacement_{axis}_std": moved[..., i].std(1, correction=0) for i, axis in enumerate("xyz")},
         "torso_velocity_error": velocity[..., :2].norm(dim=2).mean(1),
         **{f"velocity_error_{axis}": velocity[..., i].mean(1) for i, axis in enumerate("xy")},
         "arm_torque": t.arm_torque[begin:, stood].norm(dim=2).mean(1),

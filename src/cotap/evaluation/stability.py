@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -14,6 +15,7 @@ from cotap.compliance.laws import LAWS, LawConfig
 from cotap.envs import H1Env, H1EnvConfig
 from cotap.envs.persistence import uniform
 from cotap.evaluation.linearization import linearize
+from cotap.evaluation.report import save_figure
 from cotap.robots import RobotSpec
 from cotap.robots.chains import arm_model
 
@@ -140,9 +142,10 @@ class SwingingForces:
 
 
 def exchanged_energy(env: H1Env, protocol: Stability) -> torch.Tensor:
-    """Energy (T, N, H) that forces on the hands have put into the arms since their onset, at rest [J].
+    """Energy (T, N) that forces on the hands have put into the robot since their onset, at rest [J].
 
-    Nothing is stored at rest, so that a negative one has been drawn from the law. In the second half of the worlds the
+    Nothing is stored at rest, so that a negative one has been drawn from the law. Both hands count together, and what
+    they do in the world, as the waist passes energy on from one to the other. In the second half of the worlds the
     stiffness changes.
     """
     rng = torch.Generator().manual_seed(protocol.seed)
@@ -153,7 +156,7 @@ def exchanged_energy(env: H1Env, protocol: Stability) -> torch.Tensor:
     stiffness = env.upper_body.parameters.stiffness.clone()
     changing = torch.arange(env.num_envs) >= env.num_envs // 2
     hold = round(protocol.change_seconds / env.dt)
-    energy = torch.zeros(env.num_envs, len(env.spec.arms))
+    energy = torch.zeros(env.num_envs)
     rows = []
     action = torch.zeros(env.num_envs, env.num_actions)
     settle = round(protocol.settle_seconds / env.dt)
@@ -162,28 +165,29 @@ def exchanged_energy(env: H1Env, protocol: Stability) -> torch.Tensor:
             draw = uniform(rng, -0.5, 0.5, *stiffness.shape)
             changed = stiffness * protocol.change_factor**draw
             env.upper_body.parameters.stiffness = torch.where(changing[:, None, None], changed, stiffness)
-        before, force = _hands(env), forces.at(env.dt * env.episode_length_buf)[:, :-1]
+        before = _hands_w(env)
         _, _, _, extras = env.step(action)
+        work = (env.hand_force_w * (_hands_w(env) - before)).sum((1, 2))
         # Where a world has diverged it has been restarted: it has given all that can be.
-        moved = torch.where(extras["falls"][:, None, None], torch.full_like(before, -math.inf), _hands(env) - before)
-        energy = energy + torch.nan_to_num((force * moved).sum(-1), nan=-math.inf, posinf=-math.inf)
+        work = torch.where(extras["falls"], torch.full_like(work, -math.inf), work)
+        energy = energy + torch.nan_to_num(work, nan=-math.inf, posinf=-math.inf)
         if step >= settle:
             rows.append(energy.clone())
     return torch.stack(rows)
 
 
-def _hands(env: H1Env) -> torch.Tensor:
-    """(N, H, 3) relative to the torso, heading frame [m]."""
+def _hands_w(env: H1Env) -> torch.Tensor:
+    """(N, H, 3) [m]."""
     s = env.state
-    return s.arms.tip @ (s.heading_w.transpose(1, 2) @ s.torso_rotation_w).transpose(1, 2)
+    return s.torso_pos_w.unsqueeze(1) + s.arms.tip @ s.torso_rotation_w.transpose(1, 2)
 
 
 def energy_summary(energy: torch.Tensor) -> dict[str, Any]:
-    """Least energy over time, per hand and trial: mean, least, and the share of trials that lack more than nothing."""
+    """Least energy (T, N) over time, per trial: mean, least, and the share of trials that lack more than nothing."""
     out = {}
     half = energy.shape[1] // 2
     for name, part in (("constant_stiffness", energy[:, :half]), ("changing_stiffness", energy[:, half:])):
-        least = part.amin(0).flatten()
+        least = part.amin(0)
         finite = least[torch.isfinite(least)]
         out[name] = {
             "trials": least.numel(),
@@ -210,3 +214,33 @@ def table(content: dict[str, Any]) -> str:
         numbers = [f"{row[k]:.4f}" if row[k] is not None else "-" for k in ("mean_least_energy", "least_energy")]
         lines.append(f"| {name.split('_')[0]} | {numbers[0]} | {numbers[1]} | {row['share_drawn']:.1%} |")
     return "\n".join([*lines, "", f"stability, {content['method']}: {content['num_poses']} poses"])
+
+
+def plot(path: Path, content: dict[str, Any]) -> None:
+    """Growth and share of unstable poses per wall, and trials that energy is drawn from."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, 3, figsize=(12.0, 3.4), constrained_layout=True)
+    rows = content["linearised"]
+    walls = sorted({row["wall"] for row in rows})
+    for load, color in zip(sorted({row["load_rad"] for row in rows}), ("#2171b5", "#d95f02"), strict=False):
+        mine = {row["wall"]: row for row in rows if row["load_rad"] == load}
+        for axis, key in zip(axes, ("largest_real_part", "share_unstable"), strict=False):
+            label = f"joint errors of {load:g} rad" if load else "at rest"
+            axis.plot(range(len(walls)), [mine[w][key] for w in walls], "o-", color=color, label=label)
+    for axis, label in zip(axes, ("largest real part [1/s]", "share of poses unstable"), strict=False):
+        axis.set_xticks(range(len(walls)), ["free" if w == 0.0 else f"{w:g}" for w in walls])
+        axis.set(xlabel="hand held by [N/m]", ylabel=label)
+        axis.axhline(0.0, color="0.6", lw=0.8)
+        axis.legend(frameon=False)
+    axes[1].set_ylim(-0.02, 1.02)
+    names = [name.split("_")[0] for name in content["energy"]]
+    axes[2].bar(names, [row["share_drawn"] for row in content["energy"].values()], color="#2171b5", width=0.5)
+    axes[2].set(xlabel="stiffness meanwhile", ylabel="share of trials that energy is drawn from", ylim=(0.0, 1.0))
+    for axis in axes:
+        axis.grid(alpha=0.2)
+    figure.suptitle(f"stability, {content['method']}, {content['num_poses']} poses")
+    save_figure(figure, path)

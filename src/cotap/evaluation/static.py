@@ -189,6 +189,7 @@ def summary(result: StaticResult, commanded: tuple[float, ...] | None) -> dict[s
         "curve": {
             "force": result.force.tolist(),
             "displacement": [[None if math.isnan(v) else v for v in row] for row in result.displacement.tolist()],
+            "spread": result.spread.tolist(),
         },
     }
 

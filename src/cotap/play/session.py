@@ -211,6 +211,7 @@ def play_config(env: H1EnvConfig) -> H1EnvConfig:
     env.observations.noise.enabled = False
     env.terminations.episode_s = 1e6
     env.impedance.share, env.commands.steady_rad = 0.0, STEADY_RAD
+    env.upper_body.sampling.enabled = False  # what the page sets stays
     env.motions.clips.share, env.motions.clips.only, env.motions.clips.held_out = 1.0, (), ()
     env.force.force, env.force.start_s, env.force.duration_s = (0.0, 0.0, 0.0), 0.0, 1e6
     return env

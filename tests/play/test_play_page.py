@@ -1,0 +1,41 @@
+"""The script that times the page and films it: bad input, and one small film."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
+import play_page
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [(["dance"], "command 'dance' is unknown"), (["speed", "--viewers", "0"], "viewers must lie in"),
+     (["film", "--output", "no/such/play.webp"], "'no/such/play.webp': its folder does not exist"),
+     (["film", "--output", "play.mp3"], "suffix '.mp3' is unknown"), (["film", "--fps", "0"], "fps must lie in"),
+     (["speed"], "no browser")],
+)  # fmt: skip
+def test_bad_input_is_named(arguments, message, capsys, monkeypatch):
+    monkeypatch.setattr(shutil, "which", lambda _: None)
+    assert play_page.main(arguments) == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not any(map(shutil.which, play_page.BROWSERS)), reason="no browser")
+def test_a_small_film(tmp_path, capsys):
+    from PIL import Image
+
+    film, still = tmp_path / "play.webp", tmp_path / "play.png"
+    arguments = ["film", "--output", str(film), "--picture", str(still), "--scale", "0.2", "--fps", "2"]
+    assert play_page.main(arguments) == 0
+    with Image.open(film) as moving:
+        assert moving.n_frames == 9
+        assert moving.size == (220, 140)
+    with Image.open(still) as picture:
+        assert picture.size == (1100, 700)
+    assert "MB" in capsys.readouterr().out
