@@ -24,7 +24,7 @@ class _Worlds(H1Env):
     def step(self, actions: torch.Tensor) -> Any:
         """As `H1Env.step`; afterwards `final_observation` (N, width) holds in the rows of ended worlds."""
         self.final_observation = self._observations["policy"]
-        self.diverged = torch.zeros(self.num_envs, dtype=torch.bool)
+        self.diverged = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         return super().step(actions)
 
     def _finish(self, done: torch.Tensor, fell: torch.Tensor) -> None:
@@ -94,7 +94,7 @@ class H1VectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """Restart every world. With a seed, all starts over: bodies, curricula and random numbers too."""
         super().reset(seed=seed)
         self.worlds = _restarted(self.worlds, seed)
-        return self.worlds.get_observations()["policy"].numpy().copy(), {}
+        return self.worlds.get_observations()["policy"].cpu().numpy().copy(), {}
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Advance by one control step. Raises ValueError if actions (N, 19) have another shape or are not finite."""
@@ -104,7 +104,7 @@ class H1VectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         if done.any():
             infos |= self._final_infos(done.numpy())
         return (
-            observations["policy"].numpy().copy(),
+            observations["policy"].cpu().numpy().copy(),
             rewards.double().numpy(),
             extras["falls"].numpy(),
             extras["time_outs"].numpy(),
@@ -143,7 +143,7 @@ class H1SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """Start a new episode. With a seed, all starts over: the body, the curriculum and the random numbers too."""
         super().reset(seed=seed, options=options)
         self.worlds = _restarted(self.worlds, seed)
-        return self.worlds.get_observations()["policy"][0].numpy().copy(), {}
+        return self.worlds.get_observations()["policy"][0].cpu().numpy().copy(), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Advance by one control step; the observation that ends an episode is still of that episode."""
@@ -151,7 +151,13 @@ class H1SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         observations, rewards, done, extras = self.worlds.step(row)
         last = self.worlds.final_observation if done[0] else observations["policy"]
         info = {"group_rewards": extras["group_rewards"][0].numpy(), "diverged": bool(self.worlds.diverged[0])}
-        return last[0].numpy().copy(), float(rewards[0]), bool(extras["falls"][0]), bool(extras["time_outs"][0]), info
+        return (
+            last[0].cpu().numpy().copy(),
+            float(rewards[0]),
+            bool(extras["falls"][0]),
+            bool(extras["time_outs"][0]),
+            info,
+        )
 
 
 def _restarted(worlds: _Worlds, seed: int | None) -> _Worlds:
