@@ -150,7 +150,7 @@ class Properties:
             right, at = self._moved(name, self.stiffness)
             wrong, misled = self._moved(name, self.stiffness, wrong=True)
             arms = self._laws(name, self.stiffness).configure()
-            cfg = self.stability.configure(H1EnvConfig(num_threads=self.threads))
+            cfg = self.stability.configure(H1EnvConfig(backend="mjbatch", num_threads=self.threads))
             cfg.upper_body = arms
             rows[name] = {
                 "softer_over_stiffer": soft / stiff,
@@ -168,7 +168,7 @@ class Properties:
     def _moved(self, name: str, stiffness: float, wrong: bool = False) -> tuple[float, torch.Tensor]:
         """Downward displacement under the load, pelvis fixed, and where (3,) the hand is without one [m]."""
         protocol = StaticStiffness(force=(0.0, 0.0, -self.load), levels=2, settle_seconds=self.settle_seconds)
-        cfg = protocol.configure(H1EnvConfig(num_threads=self.threads))
+        cfg = protocol.configure(H1EnvConfig(backend="mjbatch", num_threads=self.threads))
         cfg.upper_body = self._laws(name, stiffness).configure()
         env = H1Env(cfg)
         if wrong:

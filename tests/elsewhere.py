@@ -115,6 +115,10 @@ class _Generator(torch.Generator):
         return self.place
 
 
+def _autocast(device_type: str, *args: Any, **kwargs: Any) -> Any:
+    return torch.amp.autocast_mode.autocast("cpu" if device_type == DEVICE else device_type, *args, **kwargs)
+
+
 class _Simulation(BatchSimulation):
     """mjbatch's worlds, seen as tensors on `DEVICE` that share its memory."""
 
@@ -143,6 +147,7 @@ def _make_simulation(backend: str, *args: Any) -> Simulation:  # noqa: ARG001
 def elsewhere(patch: Callable[..., None]) -> Iterator[None]:
     """Have `DEVICE` for a while, and environments simulate on it. `patch` is `monkeypatch.setattr`."""
     patch(torch, "Generator", _Generator)
+    patch(torch, "autocast", _autocast)
     patch(h1_env, "make_simulation", _make_simulation)
     with _FromData(), _Operations():
         yield

@@ -106,9 +106,8 @@ class Blows(Stateful):
         direction = torch.stack((pitch.cos() * yaw.cos(), pitch.cos() * yaw.sin(), pitch.sin()), -1)
         hand = torch.randint(hands, (n,), generator=rng, device=rng.device)
         force = torch.zeros(n, hands, 3, device=rng.device)
-        force[torch.arange(n, device=rng.device), hand] = (uniform(rng, *cfg.force, n) * self.scale[mask]).unsqueeze(
-            1
-        ) * direction
+        size = uniform(rng, *cfg.force, n) * self.scale[mask]
+        force[torch.arange(n, device=rng.device), hand] = size.unsqueeze(1) * direction
         self._force_h[mask], self._since_s[mask] = force, 0.0
         self._duration_s[mask] = uniform(rng, *cfg.duration_s, n)
         self._interval_s[mask] = uniform(rng, *cfg.interval_s, n)

@@ -59,7 +59,8 @@ def _spaces(worlds: H1Env) -> tuple[Box, Box]:
 
 
 class H1VectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
-    """N robots in one batch: observations (N, 430), actions (N, 19), rewards (N,) the sum of both agents'.
+    """N robots in one batch: observations (N, 430), actions (N, 19), rewards (N,) the sum of both agents'. Arrays are
+    on the processor whatever the backend.
 
     Falls terminate an episode, its length truncates it. Ended worlds restart within the step (autoreset SAME_STEP): the
     observation is the new episode's first, `infos["final_obs"]` has the old one's last, and
@@ -98,25 +99,27 @@ class H1VectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Advance by one control step. Raises ValueError if actions (N, 19) have another shape or are not finite."""
-        observations, rewards, done, extras = self.worlds.step(torch.as_tensor(np.asarray(actions, dtype=np.float32)))
+        observations, rewards, done, extras = self.worlds.step(
+            torch.as_tensor(np.asarray(actions, dtype=np.float32), device=self.worlds.device)
+        )
         everyone = np.ones(self.num_envs, dtype=bool)
-        infos: dict[str, Any] = {"group_rewards": extras["group_rewards"].numpy(), "_group_rewards": everyone}
+        infos: dict[str, Any] = {"group_rewards": extras["group_rewards"].cpu().numpy(), "_group_rewards": everyone}
         if done.any():
-            infos |= self._final_infos(done.numpy())
+            infos |= self._final_infos(done.cpu().numpy())
         return (
             observations["policy"].cpu().numpy().copy(),
-            rewards.double().numpy(),
-            extras["falls"].numpy(),
-            extras["time_outs"].numpy(),
+            rewards.double().cpu().numpy(),
+            extras["falls"].cpu().numpy(),
+            extras["time_outs"].cpu().numpy(),
             infos,
         )
 
     def _final_infos(self, done: np.ndarray) -> dict[str, Any]:
-        last = self.worlds.final_observation.numpy()
+        last = self.worlds.final_observation.cpu().numpy()
         final_obs = np.full(self.num_envs, None, dtype=object)
         for i in done.nonzero()[0]:
             final_obs[i] = last[i].copy()
-        diverged_worlds = {"diverged": self.worlds.diverged.numpy(), "_diverged": done.copy()}
+        diverged_worlds = {"diverged": self.worlds.diverged.cpu().numpy(), "_diverged": done.copy()}
         return {
             "final_obs": final_obs,
             "_final_obs": done.copy(),
@@ -147,10 +150,10 @@ class H1SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Advance by one control step; the observation that ends an episode is still of that episode."""
-        row = torch.as_tensor(np.asarray(action, dtype=np.float32)).unsqueeze(0)
+        row = torch.as_tensor(np.asarray(action, dtype=np.float32), device=self.worlds.device).unsqueeze(0)
         observations, rewards, done, extras = self.worlds.step(row)
         last = self.worlds.final_observation if done[0] else observations["policy"]
-        info = {"group_rewards": extras["group_rewards"][0].numpy(), "diverged": bool(self.worlds.diverged[0])}
+        info = {"group_rewards": extras["group_rewards"][0].cpu().numpy(), "diverged": bool(self.worlds.diverged[0])}
         return (
             last[0].cpu().numpy().copy(),
             float(rewards[0]),

@@ -47,7 +47,7 @@ from cotap.robots import ROBOTS
 from cotap.robots.ground import HALF_EXTENT_M
 from cotap.robots.mjcf import COLLISIONS, FIXED_BASE_LIFT_M, build_model
 from cotap.rotations import quat_about_z, quat_from_matrix, rotate
-from cotap.sim import BACKENDS, DelayedTargets, Snapshot, make_simulation
+from cotap.sim import DelayedTargets, Snapshot, make_simulation, resolve_backend
 
 GRAVITY = 9.81
 
@@ -107,7 +107,7 @@ class H1EnvConfig:
         require_positive_int("num_envs", self.num_envs)
         require_positive_int("substeps", self.substeps)
         require_one_of("robot", self.robot, ROBOTS.keys())
-        require_one_of("backend", self.backend, BACKENDS)
+        resolve_backend(self.backend)
         require_one_of("collision", self.collision, COLLISIONS)
         require_range("control_dt", self.control_dt, 1e-4, 1.0)
         require_range("torque_limit_scale", self.torque_limit_scale, 1e-3, 1e3)
