@@ -15,7 +15,6 @@ from typing import Any
 import torch
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves, tree_map
 
 from cotap.envs import h1_env
 from cotap.sim import BatchSimulation, Simulation
@@ -50,7 +49,8 @@ class Elsewhere(torch.Tensor):
 
 def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     """`func` on the real tensors; its results are where the device says that was asked for, or else the arguments."""
-    tensors = [t for t in tree_leaves((args, kwargs)) if isinstance(t, torch.Tensor)]
+    tensors: list[torch.Tensor] = []
+    _each(tensors.append, (args, kwargs))
     there = {id(t.held): t for t in tensors if isinstance(t, Elsewhere)}
     if there and func not in _COPIES:
         for t in tensors:
@@ -62,15 +62,20 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     if kwargs.get("device") is not None:
         goes = kwargs["device"] == torch.device(DEVICE)
         kwargs = kwargs | {"device": _HERE}
-    args, kwargs = tree_map(lambda t: t.held if isinstance(t, Elsewhere) else t, (args, kwargs))
+    args, kwargs = _each(lambda t: t.held if isinstance(t, Elsewhere) else t, (args, kwargs))
     out = func(*args, **kwargs)
+    return _each(lambda t: there[id(t)] if id(t) in there else Elsewhere(t), out) if goes else out
 
-    def place(t: Any) -> Any:
-        if not isinstance(t, torch.Tensor) or not goes:
-            return t
-        return there[id(t)] if id(t) in there else Elsewhere(t)
 
-    return tree_map(place, out)
+def _each(do: Callable[[torch.Tensor], Any], value: Any) -> Any:
+    """`value`, nested lists, tuples and dicts, with what `do` makes of every tensor in its place."""
+    if isinstance(value, torch.Tensor):
+        return do(value)
+    if isinstance(value, (list, tuple)):
+        return type(value)([_each(do, v) for v in value])  # pyright: ignore[reportCallIssue]
+    if isinstance(value, dict):
+        return {k: _each(do, v) for k, v in value.items()}
+    return value
 
 
 class _Operations(TorchDispatchMode):

@@ -15,12 +15,12 @@ from cotap.envs import H1Env, H1EnvConfig
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from elsewhere import DEVICE, Elsewhere, elsewhere
 
-STEPS = 30
+STEPS = 12
 
 
 def everything() -> H1EnvConfig:
     """All that an environment can do, at once, and often."""
-    cfg = H1EnvConfig(num_envs=6, num_threads=1)
+    cfg = H1EnvConfig(num_envs=3, num_threads=1)
     cfg.assist.enabled = cfg.blows.enabled = cfg.observations.noise.enabled = cfg.observations.goals = True
     cfg.observations.arm_torque = "critic"
     cfg.upper_body.left = LawConfig(name="cotap", sensing="estimated")
@@ -39,7 +39,7 @@ def everything() -> H1EnvConfig:
     cfg.motions.clips.hold_s = (0.1, 0.3)
     cfg.rewards.upper.track_hands_as_facet = cfg.rewards.upper.stay_close = 1.0
     cfg.unevenness_m = 0.02
-    cfg.terminations.episode_s = 0.4
+    cfg.terminations.episode_s = 0.1
     return cfg
 
 

@@ -38,7 +38,7 @@ class Course:
 
     def __init__(
         self, count: int, leg: float, turn: float, radius: float, num_envs: int, rng: torch.Generator,
-        device: str = "cpu",
+        device: torch.device | str = "cpu",
     ) -> None:  # fmt: skip
         direction = uniform(rng, -turn, turn, num_envs, count).cumsum(1).to(device)
         self._legs = leg * torch.stack((direction.cos(), direction.sin(), torch.zeros_like(direction)), 2)

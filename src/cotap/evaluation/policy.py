@@ -50,7 +50,7 @@ class Policy:
     config: dict[str, Any]
     stage: str
 
-    def to(self, device: str) -> Policy:
+    def to(self, device: torch.device | str) -> Policy:
         """The same policy, its networks moved to `device`."""
         self.model.to(device)
         return self

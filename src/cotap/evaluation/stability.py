@@ -120,7 +120,7 @@ class SwingingForces:
 
     active = True
 
-    def __init__(self, protocol: Stability, num_hands: int, rng: torch.Generator, device: str) -> None:
+    def __init__(self, protocol: Stability, num_hands: int, rng: torch.Generator, device: torch.device | str) -> None:
         n = protocol.num_envs
         direction = torch.randn(n, num_hands, 3, generator=rng)
         amplitude = protocol.force * direction / direction.norm(dim=-1, keepdim=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+# MuJoCo's extension module has no type stubs.
+# pyright: reportAttributeAccessIssue=false
 from importlib.util import find_spec
 
 import mujoco

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+# MuJoCo's extension module has no type stubs.
+# pyright: reportAttributeAccessIssue=false
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass

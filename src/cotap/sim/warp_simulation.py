@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 # Warp's arrays and MuJoCo's enumerations have no type stubs.
-# pyright: reportAttributeAccessIssue=false
+# pyright: reportAttributeAccessIssue=false, reportArgumentType=false
 import copy
 
 import mujoco
