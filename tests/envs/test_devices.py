@@ -29,7 +29,7 @@ def everything() -> H1EnvConfig:
     cfg.upper_body.sampling.hold_s = (0.1, 0.2)
     cfg.upper_body.torso.model = "support"
     cfg.commands.resample_s = (0.1, 0.3)
-    cfg.commands.steady_rad = 0.2
+    cfg.commands.steady_rad, cfg.commands.step_timing = 0.2, True
     cfg.impedance.share = 0.5
     cfg.hand_forces.hold_s = (0.1, 0.2)
     cfg.hand_forces.curriculum_start = 1.0

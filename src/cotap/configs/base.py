@@ -63,6 +63,7 @@ def robust(training: BaseTraining | None = None) -> BaseTraining:
     training = copy.deepcopy(training) if training else default()
     env = training.env
     env.commands.steady_rad = STEADY_RAD
+    env.commands.step_timing = True
     env.commands.stand_probability = 0.4
     env.blows.enabled = True
     env.hand_forces.episode_share = 0.5

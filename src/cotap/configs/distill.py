@@ -29,6 +29,7 @@ def default(base: BaseTraining) -> DistillTraining:
     )
     env = training.env
     env.assist.enabled = False
+    env.commands.step_timing = True
     env.upper_body.left.name = env.upper_body.right.name = "cotap"
     env.upper_body.sampling.enabled = True
     env.upper_body.sampling.full_alpha = 0.25

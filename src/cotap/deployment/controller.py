@@ -19,6 +19,7 @@ from cotap.envs.commands import CommandConfig, CommandSource, leaning
 from cotap.envs.observations import ObservationHistory, actor_terms, actor_values
 from cotap.envs.reference import ReferenceMotion
 from cotap.envs.state import RobotState
+from cotap.envs.step_timing import StepTiming
 from cotap.envs.upper_body import UpperBody, UpperBodyConfig
 from cotap.robots import ROBOTS, RobotSpec
 from cotap.robots.chains import arm_chains
@@ -105,6 +106,7 @@ class Controller:
         self._rng = torch.Generator().manual_seed(seed)
         self._everyone = torch.ones(1, dtype=torch.bool)
         self.commands = CommandSource(commands, 1, spec.nominal_height_m, self.dt)
+        self._timing = StepTiming(spec, 1, self.dt) if commands.step_timing else None
         self.motion = motion
         self.upper_body = UpperBody(laws, spec, 1, self.dt, torch.float64)
         terms = actor_terms(len(spec.joints), len(spec.upper_joints))
@@ -121,6 +123,8 @@ class Controller:
         self._started, self._action = False, np.zeros_like(self._action)
         self.upper_body.reset(self._everyone, self._rng)
         self.commands.reset(self._everyone, self._rng)
+        if self._timing:
+            self._timing.reset(self._everyone)
         self.motion.reset(self._everyone, self._rng)
 
     @property
@@ -137,8 +141,9 @@ class Controller:
         s = readings.state
         if self._started:
             turning = s.torso_angular_velocity_t
-            lean = leaning(s.projected_gravity_t, turning)
-            self.commands.step(self._rng, lean.float(), turning[:, 2].float())
+            lean, command = leaning(s.projected_gravity_t, turning), self.commands.current()
+            catch = self._timing.step(s, command, lean > self.commands.cfg.steady_rad) if self._timing else None
+            self.commands.step(self._rng, lean.float(), turning[:, 2].float(), catch)
             self.upper_body.step(self.dt, self._rng)
         observed = self.motion.current().position
         values = actor_values(

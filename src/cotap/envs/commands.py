@@ -16,6 +16,9 @@ STEADY_RAD = 0.2
 TURNED_RAD_S = 1.0
 """Yaw rate from which a robot counts as turned by a blow [rad/s]; balance is lost at less, and then says nothing."""
 
+HURRY = 1.3
+"""How much faster the gait clock of a robot runs that catches itself."""
+
 
 @dataclass
 class CommandConfig:
@@ -46,6 +49,8 @@ class CommandConfig:
     Evaluation uses `STEADY_RAD`. Training does without (10): a robot that always steps never learns to stand."""
     gait_period_s: float = 0.8
     """Duration of a stride [s]."""
+    step_timing: bool = False
+    """Whether the gait clock jumps to where a robot that was struck catches itself (`StepTiming`)."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
@@ -75,6 +80,18 @@ class Command:
     """(N,) height of the torso link above the ground [m]."""
     phase: torch.Tensor
     """(N,) of the gait clock, in [0, 1); it rests at 0 or 0.5, both feet down, while standing."""
+
+
+@dataclass(frozen=True)
+class Catch:
+    """What the gait clock is to do in N worlds."""
+
+    jumps: torch.Tensor
+    """(N,) bool: start stepping, or go on stepping, from `phase`."""
+    phase: torch.Tensor
+    """(N,) in [0, 1)."""
+    hurries: torch.Tensor
+    """(N,) bool: run `HURRY` times as fast."""
 
 
 class CommandSource(Stateful):
@@ -135,13 +152,17 @@ class CommandSource(Stateful):
         start = torch.rand(int(mask.sum()), generator=rng, device=rng.device)
         self._phase[mask] = torch.where(stand > 0.5, 0.5 * (start < 0.5), start)
 
-    def step(self, rng: torch.Generator, lean: torch.Tensor | None = None, turning: torch.Tensor | None = None) -> None:
+    def step(
+        self, rng: torch.Generator, lean: torch.Tensor | None = None, turning: torch.Tensor | None = None,
+        catch: Catch | None = None,
+    ) -> None:  # fmt: skip
         """Advance clocks by one control step and resample what is due.
 
         Args:
             rng: Random numbers.
             lean: (N,) how far each robot is about to lean [rad], from `leaning`; None counts as upright.
             turning: (N,) how fast each robot turns, positive to the left [rad/s]; None counts as not at all.
+            catch: Where the clock jumps, and who hurries; None leaves that to `turning`.
         """
         self._remaining_s -= self._dt
         self._draw(self._remaining_s <= 0.0, rng)
@@ -151,18 +172,27 @@ class CommandSource(Stateful):
         self._height = self._height + (wanted - self._height).clamp(-limit, limit)
         self._velocity = self._velocity + (self._target[:, :3] - self._velocity).clamp(-self._rate, self._rate)
         nothing = torch.zeros_like(self._phase)
-        self._advance_gait(nothing if lean is None else lean, nothing if turning is None else turning)
+        lean, turning = nothing if lean is None else lean, nothing if turning is None else turning
+        rate = torch.full_like(self._phase, self._dt / self.cfg.gait_period_s)
+        if catch is None:
+            self._choose_foot(lean, turning)
+        else:
+            self._phase = torch.where(catch.jumps, catch.phase, self._phase)
+            self._stand = torch.where(catch.jumps, 0.0, self._stand)
+            rate = torch.where(catch.hurries, HURRY * rate, rate)
+        self._advance_gait(lean <= self.cfg.steady_rad, rate)
 
-    def _advance_gait(self, lean: torch.Tensor, turning: torch.Tensor) -> None:
-        """Run the clock while walking; come to rest at the next double support, 0 or 0.5, once asked to and steady.
-
-        A standing robot that steps for its balance while it is being turned begins with the foot that the turn carries
-        forward: the left one, phase 0.5, if it is turned to the right. With the other one it would cross its legs.
-        """
-        steady = lean <= self.cfg.steady_rad
-        catches = (self._stand > 0.5) & ~steady & (turning.abs() > TURNED_RAD_S)
+    def _choose_foot(self, lean: torch.Tensor, turning: torch.Tensor) -> None:
+        """A standing robot that steps for its balance while it is being turned begins with the foot that the turn
+        carries forward: the left one, phase 0.5, if it is turned to the right. With the other one it would cross its
+        legs."""
+        leans = lean > self.cfg.steady_rad
+        catches = (self._stand > 0.5) & leans & (turning.abs() > TURNED_RAD_S)
         self._phase = torch.where(catches, 0.5 * (turning < 0.0), self._phase)
-        half_strides = 2.0 * (self._phase + self._dt / self.cfg.gait_period_s)
+
+    def _advance_gait(self, steady: torch.Tensor, rate: torch.Tensor) -> None:
+        """Run the clock while walking; come to rest at the next double support, 0 or 0.5, once asked to and steady."""
+        half_strides = 2.0 * (self._phase + rate)
         both_down = half_strides.floor() > (2.0 * self._phase).floor()
         at_rest = (self._velocity == 0.0).all(1) & (self._target[:, 3] > 0.5) & steady
         stays = (self._stand > 0.5) & (self._target[:, 3] > 0.5) & steady

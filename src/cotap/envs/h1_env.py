@@ -39,6 +39,7 @@ from cotap.envs.randomization import RandomizationConfig, Randomizer
 from cotap.envs.reference import ReferenceConfig, ReferenceMotion
 from cotap.envs.rewards import LowerRewards, RewardGroup, StepRecord, UpperRewards, check_weights
 from cotap.envs.state import RobotState, StateReader
+from cotap.envs.step_timing import StepTiming
 from cotap.envs.symmetry import actor_reflection, critic_reflection, joint_reflection
 from cotap.envs.terminations import TerminationConfig, diverged, fallen
 from cotap.envs.upper_body import UpperBody, UpperBodyConfig
@@ -194,6 +195,7 @@ class H1Env(VecEnv):
         self._weight_n = float(model.body_mass.sum()) * GRAVITY
 
         self.commands = CommandSource(cfg.commands, n, spec.nominal_height_m, self.dt)
+        self.step_timing = StepTiming(spec, n, self.dt) if cfg.commands.step_timing else None
         self.motions = ReferenceMotion(cfg.motions, spec, n, self.dt)
         self.path = PathFollower(cfg.impedance, n, self.dt)
         self.hand_forces = HandForces(cfg.hand_forces, n, len(spec.arms), self.dt)
@@ -311,7 +313,10 @@ class H1Env(VecEnv):
         self.episode_length_buf += 1
         s = self.state
         turning = s.torso_angular_velocity_t
-        self.commands.step(self.rng, leaning(s.projected_gravity_t, turning), turning[:, 2])
+        lean = leaning(s.projected_gravity_t, turning)
+        timing, command = self.step_timing, self.commands.current()
+        catch = timing.step(s, command, lean > self.commands.cfg.steady_rad) if timing else None
+        self.commands.step(self.rng, lean, turning[:, 2], catch)
         self._follow_path()
         if self.upper_body.active:
             self.upper_body.sense(s, self._hand_force_w, self._arm_effort)
@@ -426,6 +431,7 @@ class H1Env(VecEnv):
             "randomizer": self.randomizer,
             "history": self.history,
             "clean_history": self._clean_history,
+            **({"step_timing": self.step_timing} if self.step_timing else {}),
         }
 
     def _send_to_arms(self) -> None:
@@ -625,6 +631,8 @@ class H1Env(VecEnv):
         self.randomizer.randomize_episode(mask, self.targets.delay_s, self.rng)
         self._kp, self._kd = self.randomizer.gains()
         self.commands.reset(mask, self.rng)
+        if self.step_timing:
+            self.step_timing.reset(mask)
         self.motions.reset(mask, self.rng)
         self.upper_body.reset(mask, self.rng)
         self.hand_forces.reset(mask, self.rng)

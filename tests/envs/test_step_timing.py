@@ -1,0 +1,143 @@
+"""Step timing: the gait clock jumps where that lowers the chance of a fall, and mirror images jump alike."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from cotap.envs import H1Env, H1EnvConfig, step_timing
+from cotap.envs.commands import HURRY, Catch, CommandConfig, CommandSource
+from cotap.envs.step_timing import BINS, GAIN, HURRY_S, REST_S, StepTiming, feature_reflection, features, risk_at
+from cotap.robots import ROBOTS
+
+DT = 0.02
+
+
+@pytest.fixture(scope="module")
+def env() -> H1Env:
+    cfg = H1EnvConfig(num_envs=16, num_threads=1)
+    env = H1Env(cfg)
+    for _ in range(5):
+        env.step(torch.randn(16, env.num_actions, generator=torch.Generator().manual_seed(0)))
+    return env
+
+
+def timing(num_envs: int) -> StepTiming:
+    return StepTiming(ROBOTS["h1"](), num_envs, DT)
+
+
+def test_risk_between_points_is_linear_and_wraps() -> None:
+    risk = torch.zeros(3, BINS + 1)
+    risk[:, 0], risk[:, 1], risk[:, BINS - 1], risk[:, BINS] = 0.2, 0.6, 0.4, 9.0
+    phase = torch.tensor([0.0, 0.25 / BINS, (BINS - 0.5) / BINS])
+    torch.testing.assert_close(risk_at(risk, phase), torch.tensor([0.2, 0.3, 0.3]))
+
+
+def test_mirror_images_are_judged_alike_half_a_stride_on(env: H1Env) -> None:
+    timing_ = timing(16)
+    x = features(env.state, env.commands.current(), timing_._default)
+    mirror = feature_reflection(env.spec)
+    risk, mirrored = (timing_.model(v).sigmoid().detach() for v in (x, mirror(x)))
+    torch.testing.assert_close(mirror(mirror(x)), x)
+    torch.testing.assert_close(mirrored[:, :BINS], risk[:, :BINS].roll(BINS // 2, 1), rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(mirrored[:, BINS], risk[:, BINS], rtol=1e-4, atol=1e-6)
+    assert risk.std() > 0.0
+
+
+def test_features_mirror_as_the_observation_does(env: H1Env) -> None:
+    """The environment's own reflection, tested against physics elsewhere, is the oracle."""
+    own = env.symmetry.observations["policy"]
+    observed = env.get_observations()["policy"]
+    steps = env.history.steps
+    offsets, start = {}, 0
+    for name, width, _ in env.history.terms:
+        offsets[name] = slice(start + width * (steps - 1), start + width * steps)
+        start += width * steps
+
+    def seen(x: torch.Tensor) -> torch.Tensor:
+        names = ("projected_gravity", "torso_angular_velocity", "joint_position", "joint_velocity", "command_velocity",
+                 "command_yaw_rate")  # fmt: skip
+        return torch.cat([x[:, offsets[n]] for n in names], 1)
+
+    torch.testing.assert_close(feature_reflection(env.spec)(seen(observed)), seen(own(observed)))
+
+
+@pytest.fixture
+def judged(monkeypatch: pytest.MonkeyPatch) -> StepTiming:
+    """A timing whose risks the test sets as `risk_now` (N, BINS + 1)."""
+    timing_ = timing(16)
+    monkeypatch.setattr(timing_, "risk", lambda *_: timing_.risk_now, raising=False)  # pyright: ignore[reportAttributeAccessIssue]
+    return timing_
+
+
+def test_jumps_only_for_a_gain_and_not_again_at_once(env: H1Env, judged: StepTiming) -> None:
+    command = dataclasses.replace(env.commands.current(), stand=torch.zeros(16), phase=torch.full((16,), 3 / BINS))
+    nobody = torch.zeros(16, dtype=torch.bool)
+    risk = torch.full((16, BINS + 1), 0.5)
+    risk[:8, 20] = 0.5 - GAIN - 0.01
+    risk[8:, 20] = 0.5 - GAIN + 0.01
+    judged.risk_now = risk  # pyright: ignore[reportAttributeAccessIssue]
+    catch = judged.step(env.state, command, nobody)
+    assert catch.jumps.tolist() == [True] * 8 + [False] * 8
+    torch.testing.assert_close(catch.phase[:8], torch.full((8,), 20 / BINS))
+    assert catch.hurries.tolist() == [True] * 8 + [False] * 8
+    steps = 0
+    while not (catch := judged.step(env.state, command, nobody)).jumps[0]:
+        assert catch.hurries[0]
+        steps += 1
+    assert steps == pytest.approx(REST_S / DT, abs=2)
+    judged.risk_now = torch.full((16, BINS + 1), 0.5)  # pyright: ignore[reportAttributeAccessIssue]
+    hurried = 0
+    while judged.step(env.state, command, nobody).hurries[0]:
+        hurried += 1
+    assert hurried == pytest.approx(HURRY_S / DT, abs=2)
+
+
+def test_a_standing_robot_is_judged_by_standing_on_and_must_step_when_it_leans(env: H1Env, judged: StepTiming) -> None:
+    command = dataclasses.replace(env.commands.current(), stand=torch.ones(16), phase=torch.zeros(16))
+    risk = torch.full((16, BINS + 1), 0.5)
+    risk[:, 7], risk[:, 0] = 0.3, 0.9  # at its phase it would fall; that says nothing of standing on
+    risk[:, BINS] = 0.3
+    judged.risk_now = risk  # pyright: ignore[reportAttributeAccessIssue]
+    leans = torch.arange(16) < 4
+    catch = judged.step(env.state, command, leans)
+    assert catch.jumps.tolist() == leans.tolist()
+    torch.testing.assert_close(catch.phase, torch.full((16,), 7 / BINS))
+
+
+def test_the_clock_jumps_starts_and_hurries() -> None:
+    source = CommandSource(CommandConfig(), 3, 1.0, DT)
+    source.override(torch.zeros(3, 2), torch.zeros(3), torch.ones(3), torch.ones(3))
+    source.reset(torch.ones(3, dtype=torch.bool), torch.Generator().manual_seed(0))
+    source._stand[:], source._phase[:] = 1.0, 0.0
+    yes, no = torch.tensor([True, True, False]), torch.tensor([True, False, False])
+    source.step(torch.Generator(), catch=Catch(yes, torch.tensor([0.3, 0.3, 0.3]), no))
+    now = source.current()
+    step = DT / source.cfg.gait_period_s
+    torch.testing.assert_close(now.phase, torch.tensor([0.3 + HURRY * step, 0.3 + step, 0.0]))
+    assert now.stand.tolist() == [0.0, 0.0, 1.0]
+
+
+def test_an_environment_with_it_uses_it_restarts_it_and_saves_it() -> None:
+    cfg = H1EnvConfig(num_envs=4, num_threads=1)
+    cfg.commands.step_timing = True
+    env = H1Env(cfg)
+    assert env.step_timing is not None
+    env.step_timing._since_s[:] = 0.1
+    env.step(torch.zeros(4, env.num_actions))
+    torch.testing.assert_close(env.step_timing._since_s, torch.full((4,), 0.1 + DT))
+    saved = env.state_dict()
+    env._restart(torch.tensor([True, False, False, False]))
+    assert math.isinf(env.step_timing._since_s[0])
+    env.load_state_dict(saved)
+    torch.testing.assert_close(env.step_timing._since_s, torch.full((4,), 0.1 + DT))
+
+
+def test_weights_of_another_robot_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    spec = ROBOTS["h1"]()
+    monkeypatch.setattr(step_timing, "feature_reflection", lambda _: feature_reflection(spec).part(slice(0, 6)))
+    with pytest.raises(ValueError, match="fitted for another robot than 'h1'"):
+        StepTiming(spec, 1, DT)
