@@ -63,6 +63,7 @@ def run(cfg: H1EnvConfig) -> list[torch.Tensor]:
     return seen
 
 
+@pytest.mark.filterwarnings("ignore:for .* copying from a non-meta parameter:UserWarning")
 def test_an_environment_elsewhere_computes_the_same(monkeypatch):
     here = run(everything())
     with elsewhere(monkeypatch.setattr):
