@@ -78,7 +78,7 @@ def reference_model() -> mujoco.MjModel:
 
 def full_env(num_envs: int) -> H1Env:
     """Everything on, as in training after the gantry is gone; worlds time out at different times."""
-    cfg = H1EnvConfig(num_envs=num_envs)
+    cfg = H1EnvConfig(num_envs=num_envs, backend="mjbatch")
     cfg.hand_forces.curriculum_start = 1.0
     env = H1Env(cfg)
     env.episode_length_buf = torch.randint_like(env.episode_length_buf, high=env.max_episode_length)

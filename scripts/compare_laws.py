@@ -296,7 +296,7 @@ class Properties:
             (soft, stiff, right), at = self._moved(name, (0.5 * k, 2.0 * k, k))
             (wrong,), misled = self._moved(name, (k,), wrong=True)
             arms = laws_of(name, self.stiffness).configure()
-            cfg = self.stability.configure(H1EnvConfig(num_threads=self.threads))
+            cfg = self.stability.configure(H1EnvConfig(backend="mjbatch", num_threads=self.threads))
             cfg.upper_body = arms
             rows[name] = {
                 "softer_over_stiffer": soft / stiff,
@@ -314,7 +314,7 @@ class Properties:
         Pelvis fixed; the stiffness of the hand without a load is the last.
         """
         protocol = StaticStiffness(force=(0.0, 0.0, -self.load), levels=1 + len(stiffness))
-        cfg = protocol.configure(H1EnvConfig(num_threads=self.threads))
+        cfg = protocol.configure(H1EnvConfig(backend="mjbatch", num_threads=self.threads))
         cfg.force.start_s = self.settle_seconds
         cfg.upper_body = laws_of(name, stiffness[-1]).configure()
         env = H1Env(cfg)

@@ -21,7 +21,7 @@ SPREAD = ((0.4,) * 4 + (0.1, 0.05, 0.05, 0.1, 0.05), (0.4,) * 4 + (0.1, 0.05, 0.
 
 def make_env(num_envs: int, seed: int, threads: int) -> H1Env:
     """Worlds that stand, nothing but randomisation and moving arms against them."""
-    cfg = H1EnvConfig(num_envs=num_envs, seed=seed, num_threads=threads)
+    cfg = H1EnvConfig(num_envs=num_envs, backend="mjbatch", seed=seed, num_threads=threads)
     cfg.hand_forces.enabled = cfg.blows.enabled = False
     cfg.terminations.episode_s = 1e6
     return H1Env(cfg)

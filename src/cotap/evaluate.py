@@ -43,6 +43,9 @@ class CommonOptions:
     checkpoint: str = ""
     """Checkpoint to evaluate, a file or the name of a shipped one. By default the shipped base policy for
     velocity-tracking, and for all others the shipped policy that was distilled under compliance, if there is one."""
+    backend: str = "auto"
+    """What simulates: mjbatch (the processor), warp (a graphics card), or auto: warp where there is one and the extra
+    `warp`. Results are reproducible on one machine, on graphics cards up to rounding."""
     threads: int = 0
     """Processor threads; 0 takes every processor. Results are reproducible for one number."""
     json: str = ""
@@ -185,6 +188,7 @@ def _prepare(options: CommonOptions, protocol: Any) -> tuple[H1Env, Policy, str]
     from cotap.agents.checkpoint import require_layout, sha256
     from cotap.envs import H1Env, H1EnvConfig
     from cotap.evaluation.policy import load_policy
+    from cotap.sim import resolve_backend
 
     protocol.check()
     upper_body = options.laws.configure()
@@ -198,9 +202,10 @@ def _prepare(options: CommonOptions, protocol: Any) -> tuple[H1Env, Policy, str]
     torch.manual_seed(protocol.seed)
     cfg: H1EnvConfig = protocol.configure(from_plain(H1EnvConfig, policy.config["training"]["env"]))
     cfg.upper_body, cfg.num_threads = upper_body, options.threads
+    cfg.backend = resolve_backend(options.backend)
     env = H1Env(cfg)
     require_layout(path, policy.layout, json.loads(json.dumps(env.layout())))
-    return env, policy, sha256(path)
+    return env, policy.to(env.device), sha256(path)
 
 
 def _checkpoint(options: CommonOptions) -> Path:
@@ -276,7 +281,7 @@ def velocity_tracking(options: VelocityTrackingOptions) -> dict[str, Any]:
         video = Path(options.video)
         filmed = from_plain(H1EnvConfig, policy.config["training"]["env"])
         filmed.upper_body = options.laws.configure()
-        tour_video(video, filmed, policy, video.with_suffix(".png"))
+        tour_video(video, filmed, policy.to("cpu"), video.with_suffix(".png"))
     return result
 
 

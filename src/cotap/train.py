@@ -25,8 +25,9 @@ from cotap.configs import (
     from_plain,
     to_plain,
 )
+from cotap.sim import resolve_backend
 
-SHORTCUTS = {"--num-envs": "--env.num-envs", "--iterations": "--runner.iterations"}
+SHORTCUTS = {"--num-envs": "--env.num-envs", "--iterations": "--runner.iterations", "--backend": "--env.backend"}
 STAGES = ("base", "distill")
 
 
@@ -34,7 +35,7 @@ STAGES = ("base", "distill")
 class BaseOptions:
     """Stage 1: a base policy. Legs follow velocity, yaw rate, height and stand commands; arms follow a reference.
 
-    `--num-envs` and `--iterations` are short for `--env.num-envs` and `--runner.iterations`.
+    `--num-envs`, `--iterations` and `--backend` are short for `--env.num-envs`, `--runner.iterations`, `--env.backend`.
     """
 
     run_dir: str = ""
@@ -53,7 +54,7 @@ class BaseOptions:
 class DistillOptions:
     """Stage 2: arms under compliance, a policy that begins as the base and is guided by it while it learns.
 
-    `--num-envs` and `--iterations` are short for `--env.num-envs` and `--runner.iterations`.
+    `--num-envs`, `--iterations` and `--backend` are short for `--env.num-envs`, `--runner.iterations`, `--env.backend`.
     """
 
     run_dir: str = ""
@@ -89,12 +90,18 @@ class PipelineOptions:
     """Seed of both stages."""
     threads: int = 0
     """Processor threads; 0 takes every processor."""
+    backend: str = "auto"
+    """What simulates, in all stages: mjbatch (the processor), warp (a graphics card), or auto: warp where there is one
+    and the extra `warp`."""
+    device: str = "cpu"
+    """Where the networks live, in all stages."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
         for name in ("num_envs", "base_iterations", "robust_iterations", "distill_iterations"):
             require_positive_int(name, getattr(self, name))
         require_range("threads", self.threads, 0, 4096)
+        resolve_backend(self.backend)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -243,7 +250,7 @@ def _train(stage: str, options: BaseOptions | DistillOptions, base: dict[str, An
     run_dir = Path(options.run_dir) if options.run_dir else resumed_dir or _new_run_dir(stage)
     training.env.seed, training.env.num_threads = training.seed, training.threads
     training.check()
-    config = {"stage": stage, "training": to_plain(training), **_provenance(options.command)}
+    config = {"stage": stage, "training": to_plain(training), **_provenance(options.command, training.env.backend)}
     training.env.seed, training.env.num_threads = ranks.seed(training.seed), ranks.threads(training.threads)
     training.device = ranks.device(training.device)
     if training.env.num_threads:
@@ -300,7 +307,10 @@ def train_both(options: PipelineOptions) -> Path:
     if Ranks.from_environment().size > 1:
         raise ValueError("several processes train stage by stage: python -m cotap.train base, then distill")
     run_dir = Path(options.run_dir) if options.run_dir else _new_run_dir("cotap")
-    common = ["--num-envs", str(options.num_envs), "--seed", str(options.seed), "--threads", str(options.threads)]
+    common = [
+        "--num-envs", str(options.num_envs), "--seed", str(options.seed), "--threads", str(options.threads),
+        "--backend", options.backend, "--device", options.device,
+    ]  # fmt: skip
     walking = _train_base_with(
         [*common, "--iterations", str(options.base_iterations), "--run-dir", str(run_dir / "base")]
     )
@@ -347,8 +357,8 @@ def _summary(run_dir: Path) -> str:
     return "\n".join(lines)
 
 
-def _provenance(command: str) -> dict[str, str]:
-    """What else a run should remember: the code it ran, the command, the machine."""
+def _provenance(command: str, backend: str) -> dict[str, str]:
+    """What else a run should remember: the code it ran, the command, the machine, what simulated."""
     try:
         git = ["git", "-C", str(Path(__file__).parent)]
         commit = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True).stdout.strip()
@@ -357,7 +367,7 @@ def _provenance(command: str) -> dict[str, str]:
     except (OSError, subprocess.CalledProcessError):
         commit = f"cotap {__version__}"
     machine = f"{platform.machine()}, {os.cpu_count()} processors, Python {platform.python_version()}"
-    return {"commit": commit, "command": command, "machine": machine}
+    return {"commit": commit, "command": command, "machine": machine, "simulation": resolve_backend(backend)}
 
 
 def _new_run_dir(stage: str) -> Path:

@@ -4,14 +4,14 @@ import pytest
 import torch
 
 from cotap.envs.randomization import RandomizationConfig, Randomizer
-from cotap.sim import Simulation
+from cotap.sim import BatchSimulation
 
 N = 200
 
 
 @pytest.fixture
-def sim(model) -> Simulation:
-    return Simulation(model, N, 2, 1, Randomizer.FIELDS)
+def sim(model) -> BatchSimulation:
+    return BatchSimulation(model, N, 2, 1, Randomizer.FIELDS)
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ import torch
 from cotap.envs.state import StateReader
 from cotap.robots import RobotSpec
 from cotap.robots.mjcf import build_model
-from cotap.sim import Simulation
+from cotap.sim import BatchSimulation
 
 N = 12
 
@@ -51,7 +51,7 @@ def read(robot, tumbling_model):
     """A state and the single worlds that it must agree with."""
     model = tumbling_model
     rng = torch.Generator().manual_seed(3)
-    sim = Simulation(model, N, 2, 1)
+    sim = BatchSimulation(model, N, 2, 1)
     qpos = torch.zeros(N, model.nq, dtype=torch.float64)
     qpos[:, :3] = torch.randn(N, 3, generator=rng)
     qpos[:, 3:7] = torch.nn.functional.normalize(torch.randn(N, 4, generator=rng), dim=1)
@@ -141,7 +141,7 @@ def test_feet(read, tumbling_model):
 
 def test_foot_force_and_contact(spec, model):
     """One foot on the floor carries the load that MuJoCo's contacts report; the other, lifted, none."""
-    sim = Simulation(model, 1, 2, 1)
+    sim = BatchSimulation(model, 1, 2, 1)
     qpos = torch.zeros(1, model.nq)
     qpos[0, 2], qpos[0, 3] = spec.nominal_height_m - 0.003, 1.0
     qpos[0, 7:] = torch.tensor([j.default_rad for j in spec.joints])

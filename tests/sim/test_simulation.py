@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from cotap.sim import DelayedTargets, Simulation
+from cotap.sim import BatchSimulation, DelayedTargets
 
 N = 3
 FREE_BODY = """
@@ -17,8 +17,8 @@ FREE_BODY = """
 
 
 @pytest.fixture
-def sim(model) -> Simulation:
-    return Simulation(model, N, substeps=2, num_threads=1, fields=("body_mass", "body_inertia", "geom_friction"))
+def sim(model) -> BatchSimulation:
+    return BatchSimulation(model, N, substeps=2, num_threads=1, fields=("body_mass", "body_inertia", "geom_friction"))
 
 
 def start(model, height=2.0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -98,7 +98,7 @@ def test_reset_refuses_a_mask_of_another_size(sim, model):
 
 def test_masses_differ_in_effect_between_worlds():
     model = mujoco.MjModel.from_xml_string(FREE_BODY)
-    sim = Simulation(model, 2, substeps=1, num_threads=1, fields=("body_mass", "body_inertia"))
+    sim = BatchSimulation(model, 2, substeps=1, num_threads=1, fields=("body_mass", "body_inertia"))
     sim.field("body_mass")[1, 1] = 8.0
     sim.field("body_inertia")[1, 1] *= 4.0
     sim.update_constants()
@@ -109,7 +109,7 @@ def test_masses_differ_in_effect_between_worlds():
 
 
 def test_update_constants_follows_masses(model):
-    sim = Simulation(model, 2, 1, 1, fields=("body_mass", "body_inertia", "body_subtreemass"))
+    sim = BatchSimulation(model, 2, 1, 1, fields=("body_mass", "body_inertia", "body_subtreemass"))
     sim.field("body_mass")[1] *= 2.0
     sim.field("body_inertia")[1] *= 2.0
     sim.update_constants()
@@ -117,7 +117,7 @@ def test_update_constants_follows_masses(model):
 
 
 def test_friction_differs_in_effect_between_worlds(spec, model):
-    sim = Simulation(model, 2, 2, 1, fields=("geom_friction",))
+    sim = BatchSimulation(model, 2, 2, 1, fields=("geom_friction",))
     sim.field("geom_friction")[0, :, 0] = 0.05
     sim.field("geom_friction")[1, :, 0] = 1.0
     qpos = torch.zeros(2, model.nq)
@@ -143,7 +143,7 @@ def test_undeclared_fields_are_refused(sim):
 
 def test_a_force_at_the_hand_is_mj_apply_ft(model, rng):
     """Acceleration and motion are those of the generalised force that MuJoCo itself computes for the point."""
-    sim = Simulation(model, N, 1, 1)
+    sim = BatchSimulation(model, N, 1, 1)
     qpos, qvel = start(model)
     qpos[:, 3:7] = torch.nn.functional.normalize(torch.randn(N, 4, generator=rng), dim=1)
     qpos[:, 7:] = 0.5 * torch.randn(N, 19, generator=rng)
@@ -192,7 +192,7 @@ def test_snapshot_and_restore_reproduce_the_future_bit_for_bit(sim, model, rng):
     sim.restore(snapshot)
     assert torch.equal(sim.sensors, snapshot.sensors)
     assert torch.equal(run(10), future)
-    stranger = Simulation(model, N, 2, 1, fields=("body_mass", "body_inertia", "geom_friction"))
+    stranger = BatchSimulation(model, N, 2, 1, fields=("body_mass", "body_inertia", "geom_friction"))
     sim.restore(snapshot)
     stranger.restore(snapshot)
     sim = stranger
@@ -200,10 +200,10 @@ def test_snapshot_and_restore_reproduce_the_future_bit_for_bit(sim, model, rng):
 
 
 def test_restore_refuses_other_sizes_and_fields(sim, model):
-    snapshot = Simulation(model, N + 1, 2, 1).snapshot()
+    snapshot = BatchSimulation(model, N + 1, 2, 1).snapshot()
     with pytest.raises(ValueError, match=r"snapshot\.state must have shape"):
         sim.restore(snapshot)
-    snapshot = Simulation(model, N, 2, 1).snapshot()
+    snapshot = BatchSimulation(model, N, 2, 1).snapshot()
     with pytest.raises(ValueError, match=r"snapshot has fields \[\], not \['body_inertia'"):
         sim.restore(snapshot)
 
@@ -211,7 +211,7 @@ def test_restore_refuses_other_sizes_and_fields(sim, model):
 @pytest.mark.parametrize("bad", [{"num_envs": 0}, {"substeps": -1}])
 def test_sizes_must_be_positive(model, bad):
     with pytest.raises(ValueError, match=rf"{next(iter(bad))} must be a positive integer"):
-        Simulation(model, **{"num_envs": 1, "substeps": 1, **bad})
+        BatchSimulation(model, **{"num_envs": 1, "substeps": 1, **bad})
 
 
 @pytest.mark.parametrize(

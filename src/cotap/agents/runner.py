@@ -144,7 +144,7 @@ class DualRunner(OnPolicyRunner):
             run_log = RunLog(self.run_dir, env.samples)  # pyright: ignore[reportAttributeAccessIssue]
             precision = str(alg.dtype).removeprefix("torch.")
             processes = f"{ranks.size} x " if ranks.size > 1 else ""
-            worlds = f"{processes}{env.num_envs} worlds"
+            worlds = f"{processes}{env.num_envs} worlds on {env.device}"
             say(f"{worlds}, networks {alg.cfg.hidden} in {precision} on {self.device}, {self.run_dir}")
         obs = self._observations()
         self._saved = -1

@@ -24,7 +24,7 @@ class BaseTraining:
     threads: int = 0
     """Processor threads of torch and physics; 0 takes every processor. A run is reproducible for one number."""
     device: str = "cpu"
-    """Where the networks live; physics is on the processor."""
+    """Where the networks live; physics is where `env.backend` has it."""
     env: H1EnvConfig = field(default_factory=H1EnvConfig)
     ppo: DualPPOConfig = field(default_factory=DualPPOConfig)
     runner: RunnerConfig = field(default_factory=RunnerConfig)

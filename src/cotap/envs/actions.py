@@ -67,9 +67,9 @@ class JointTargets:
         self.num_lower = len(spec.lower_joints)
         self.steps = StepMotion(spec, model, gait_period_s, cfg.step_lift, cfg.step_stride)
         self.stance = StanceBalance(spec, model)
-        self.scale = torch.full((len(spec.joints),), cfg.lower_scale)
+        twists = [j.axis == (0.0, 0.0, 1.0) for j in spec.joints]
+        self.scale = torch.tensor([cfg.twist_scale if twist else cfg.lower_scale for twist in twists])
         """(J,) radians per unit of action."""
-        self.scale[[j.axis == (0.0, 0.0, 1.0) for j in spec.joints]] = cfg.twist_scale
         self.scale[self.num_lower :] = cfg.upper_scale
 
     def __call__(

@@ -72,7 +72,7 @@ class Blows(Stateful):
         # Nothing to recover from: the clock begins where a blow would count as taken.
         self._since_s[mask] = self.cfg.recovery_s + self._dt
         self._interval_s[mask] = uniform(rng, *self.cfg.interval_s, int(mask.sum())) + self.cfg.recovery_s
-        spared = torch.rand(int(mask.sum()), generator=rng) >= self.cfg.episode_share
+        spared = torch.rand(int(mask.sum()), generator=rng, device=rng.device) >= self.cfg.episode_share
         self._interval_s[mask] = torch.where(spared, NEVER_S, self._interval_s[mask])
 
     def recovering(self) -> torch.Tensor:
@@ -104,9 +104,10 @@ class Blows(Stateful):
         cfg = self.cfg
         yaw, pitch = uniform(rng, -math.pi, math.pi, n), uniform(rng, -_LARGEST_PITCH_RAD, _LARGEST_PITCH_RAD, n)
         direction = torch.stack((pitch.cos() * yaw.cos(), pitch.cos() * yaw.sin(), pitch.sin()), -1)
-        hand = torch.randint(hands, (n,), generator=rng)
-        force = torch.zeros(n, hands, 3)
-        force[torch.arange(n), hand] = (uniform(rng, *cfg.force, n) * self.scale[mask]).unsqueeze(1) * direction
+        hand = torch.randint(hands, (n,), generator=rng, device=rng.device)
+        force = torch.zeros(n, hands, 3, device=rng.device)
+        size = uniform(rng, *cfg.force, n) * self.scale[mask]
+        force[torch.arange(n, device=rng.device), hand] = size.unsqueeze(1) * direction
         self._force_h[mask], self._since_s[mask] = force, 0.0
         self._duration_s[mask] = uniform(rng, *cfg.duration_s, n)
         self._interval_s[mask] = uniform(rng, *cfg.interval_s, n)

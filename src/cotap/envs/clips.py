@@ -35,9 +35,9 @@ class ClipPlayer(Stateful):
     def draw(self, mask: torch.Tensor, rng: torch.Generator) -> None:
         """A random clip, at a random place, in the worlds of `mask`. Clips are equally likely."""
         n = int(mask.sum())
-        clip = torch.randint(0, len(self.names), (n,), generator=rng)
+        clip = torch.randint(0, len(self.names), (n,), generator=rng, device=rng.device)
         self.clip[mask] = clip
-        self._frame[mask] = torch.rand(n, generator=rng) * self._last[clip]
+        self._frame[mask] = torch.rand(n, generator=rng, device=rng.device) * self._last[clip]
 
     def start(self, mask: torch.Tensor, clip: int) -> None:
         """Begin clip number `clip` in the worlds of `mask`."""

@@ -129,7 +129,8 @@ class CommandSource(Stateful):
     ) -> None:
         """Hold these commands, (N, 2), (N,), (N,), (N,), until further notice; each is approached at its rate."""
         self.resample = False
-        self._target = torch.cat((velocity, torch.stack((yaw_rate, stand.float(), height), 1)), 1)
+        target = torch.cat((velocity, torch.stack((yaw_rate, stand.float(), height), 1)), 1)
+        self._target = target.to(self._velocity.device)
 
     def set_velocity(self, velocity: torch.Tensor, yaw_rate: torch.Tensor, mask: torch.Tensor) -> None:
         """In the worlds of `mask` (N,), walk at these velocities (N, 2) and yaw rates (N,), at once."""
@@ -148,7 +149,7 @@ class CommandSource(Stateful):
         stand = self._target[mask, 3]
         self._stand[mask] = stand
         # A random start in the stride, so that worlds are not in step with each other.
-        start = torch.rand(int(mask.sum()), generator=rng)
+        start = torch.rand(int(mask.sum()), generator=rng, device=rng.device)
         self._phase[mask] = torch.where(stand > 0.5, 0.5 * (start < 0.5), start)
 
     def step(
@@ -215,11 +216,11 @@ class CommandSource(Stateful):
         velocity = torch.stack(
             [uniform(rng, *bounds, n) for bounds in (cfg.velocity_x, cfg.velocity_y, cfg.yaw_rate)], 1
         )
-        velocity *= torch.rand(n, 3, generator=rng) >= cfg.axis_zero_probability
-        stand = (torch.rand(n, generator=rng) < cfg.stand_probability).float()
+        velocity *= torch.rand(n, 3, generator=rng, device=rng.device) >= cfg.axis_zero_probability
+        stand = (torch.rand(n, generator=rng, device=rng.device) < cfg.stand_probability).float()
         offset = uniform(rng, *cfg.height_offset, n)
         # Height is commanded in stance only; half of the stances are at nominal height.
-        offset *= stand * (torch.rand(n, generator=rng) < 0.5)
+        offset *= stand * (torch.rand(n, generator=rng, device=rng.device) < 0.5)
         self._target[mask] = torch.cat(
             (velocity * (1.0 - stand).unsqueeze(1), torch.stack((stand, self._nominal + offset), 1)), 1
         )

@@ -75,7 +75,7 @@ class HandForces(Stateful):
     def reset(self, mask: torch.Tensor, rng: torch.Generator) -> None:
         """An episode begins in the worlds of `mask`."""
         if self.cfg.enabled:
-            self._loaded[mask] = torch.rand(int(mask.sum()), generator=rng) < self.cfg.episode_share
+            self._loaded[mask] = torch.rand(int(mask.sum()), generator=rng, device=rng.device) < self.cfg.episode_share
             self._draw(mask, rng)
 
     def _draw(self, mask: torch.Tensor, rng: torch.Generator) -> None:
@@ -85,7 +85,9 @@ class HandForces(Stateful):
         cfg = self.cfg
         bounds = (cfg.force_x, cfg.force_y, cfg.force_z)
         force = torch.stack([uniform(rng, *b, n, hands) for b in bounds], -1)
-        self._force_h[mask] = force * (torch.rand(n, hands, 3, generator=rng) >= cfg.zero_probability)
+        self._force_h[mask] = force * (
+            torch.rand(n, hands, 3, generator=rng, device=rng.device) >= cfg.zero_probability
+        )
         self._remaining_s[mask] = uniform(rng, *cfg.hold_s, n)
 
     def step(self, rng: torch.Generator) -> None:
@@ -214,7 +216,7 @@ def assist_wrench(
         height_error: (N,) commanded minus actual height [m].
         climb: (N,) vertical velocity [m/s].
     """
-    vertical = torch.tensor([0.0, 0.0, 1.0]).expand_as(up_w)
+    vertical = torch.tensor([0.0, 0.0, 1.0], device=up_w.device).expand_as(up_w)
     upright = cfg.upright_stiffness * torch.linalg.cross(up_w, vertical)
     damping = cfg.upright_damping * angular_velocity_w[:, :2]
     turn = cfg.yaw_gain * yaw_rate_error

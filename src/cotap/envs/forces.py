@@ -64,7 +64,7 @@ class ScriptedForces(Stateful):
         n = int(mask.sum())
         if not (self.cfg.random_direction and self.active) or n == 0:
             return
-        angle = 2.0 * math.pi * torch.rand(n, generator=rng)
+        angle = 2.0 * math.pi * torch.rand(n, generator=rng, device=rng.device)
         c, s = angle.cos()[:, None], angle.sin()[:, None]
         x, y, z = self.amplitude_h[mask].unbind(-1)
         self.amplitude_h[mask] = torch.stack((c * x - s * y, s * x + c * y, z), -1)

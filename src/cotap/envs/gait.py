@@ -16,7 +16,7 @@ STANCE_SHARE = 0.58
 
 def foot_phases(phase: torch.Tensor, num_feet: int) -> torch.Tensor:
     """Each foot's own phase, (N, num_feet) in [0, 1), for the clock's (N,): foot i is i / num_feet ahead."""
-    shift = torch.arange(num_feet, dtype=phase.dtype) / num_feet
+    shift = torch.arange(num_feet, dtype=phase.dtype, device=phase.device) / num_feet
     return (phase.unsqueeze(1) + shift).remainder(1.0)
 
 

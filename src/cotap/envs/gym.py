@@ -24,7 +24,7 @@ class _Worlds(H1Env):
     def step(self, actions: torch.Tensor) -> Any:
         """As `H1Env.step`; afterwards `final_observation` (N, width) holds in the rows of ended worlds."""
         self.final_observation = self._observations["policy"]
-        self.diverged = torch.zeros(self.num_envs, dtype=torch.bool)
+        self.diverged = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         return super().step(actions)
 
     def _finish(self, done: torch.Tensor, fell: torch.Tensor) -> None:
@@ -59,7 +59,8 @@ def _spaces(worlds: H1Env) -> tuple[Box, Box]:
 
 
 class H1VectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
-    """N robots in one batch: observations (N, 430), actions (N, 19), rewards (N,) the sum of both agents'.
+    """N robots in one batch: observations (N, 430), actions (N, 19), rewards (N,) the sum of both agents'. Arrays are
+    on the processor whatever the backend.
 
     Falls terminate an episode, its length truncates it. Ended worlds restart within the step (autoreset SAME_STEP): the
     observation is the new episode's first, `infos["final_obs"]` has the old one's last, and
@@ -94,29 +95,31 @@ class H1VectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """Restart every world. With a seed, all starts over: bodies, curricula and random numbers too."""
         super().reset(seed=seed)
         self.worlds = _restarted(self.worlds, seed)
-        return self.worlds.get_observations()["policy"].numpy().copy(), {}
+        return self.worlds.get_observations()["policy"].cpu().numpy().copy(), {}
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Advance by one control step. Raises ValueError if actions (N, 19) have another shape or are not finite."""
-        observations, rewards, done, extras = self.worlds.step(torch.as_tensor(np.asarray(actions, dtype=np.float32)))
+        observations, rewards, done, extras = self.worlds.step(
+            torch.as_tensor(np.asarray(actions, dtype=np.float32), device=self.worlds.device)
+        )
         everyone = np.ones(self.num_envs, dtype=bool)
-        infos: dict[str, Any] = {"group_rewards": extras["group_rewards"].numpy(), "_group_rewards": everyone}
+        infos: dict[str, Any] = {"group_rewards": extras["group_rewards"].cpu().numpy(), "_group_rewards": everyone}
         if done.any():
-            infos |= self._final_infos(done.numpy())
+            infos |= self._final_infos(done.cpu().numpy())
         return (
-            observations["policy"].numpy().copy(),
-            rewards.double().numpy(),
-            extras["falls"].numpy(),
-            extras["time_outs"].numpy(),
+            observations["policy"].cpu().numpy().copy(),
+            rewards.double().cpu().numpy(),
+            extras["falls"].cpu().numpy(),
+            extras["time_outs"].cpu().numpy(),
             infos,
         )
 
     def _final_infos(self, done: np.ndarray) -> dict[str, Any]:
-        last = self.worlds.final_observation.numpy()
+        last = self.worlds.final_observation.cpu().numpy()
         final_obs = np.full(self.num_envs, None, dtype=object)
         for i in done.nonzero()[0]:
             final_obs[i] = last[i].copy()
-        diverged_worlds = {"diverged": self.worlds.diverged.numpy(), "_diverged": done.copy()}
+        diverged_worlds = {"diverged": self.worlds.diverged.cpu().numpy(), "_diverged": done.copy()}
         return {
             "final_obs": final_obs,
             "_final_obs": done.copy(),
@@ -143,15 +146,21 @@ class H1SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """Start a new episode. With a seed, all starts over: the body, the curriculum and the random numbers too."""
         super().reset(seed=seed, options=options)
         self.worlds = _restarted(self.worlds, seed)
-        return self.worlds.get_observations()["policy"][0].numpy().copy(), {}
+        return self.worlds.get_observations()["policy"][0].cpu().numpy().copy(), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Advance by one control step; the observation that ends an episode is still of that episode."""
-        row = torch.as_tensor(np.asarray(action, dtype=np.float32)).unsqueeze(0)
+        row = torch.as_tensor(np.asarray(action, dtype=np.float32), device=self.worlds.device).unsqueeze(0)
         observations, rewards, done, extras = self.worlds.step(row)
         last = self.worlds.final_observation if done[0] else observations["policy"]
-        info = {"group_rewards": extras["group_rewards"][0].numpy(), "diverged": bool(self.worlds.diverged[0])}
-        return last[0].numpy().copy(), float(rewards[0]), bool(extras["falls"][0]), bool(extras["time_outs"][0]), info
+        info = {"group_rewards": extras["group_rewards"][0].cpu().numpy(), "diverged": bool(self.worlds.diverged[0])}
+        return (
+            last[0].cpu().numpy().copy(),
+            float(rewards[0]),
+            bool(extras["falls"][0]),
+            bool(extras["time_outs"][0]),
+            info,
+        )
 
 
 def _restarted(worlds: _Worlds, seed: int | None) -> _Worlds:

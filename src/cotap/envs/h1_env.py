@@ -7,6 +7,9 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from typing import Any, cast
 
+# MuJoCo's extension module has no type stubs.
+# pyright: reportAttributeAccessIssue=false
+import mujoco
 import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
@@ -30,7 +33,7 @@ from cotap.envs.observations import (
     critic_terms,
     noise_amplitude,
 )
-from cotap.envs.persistence import restored, uniform
+from cotap.envs.persistence import on_processor, restored, uniform
 from cotap.envs.punches import PunchConfig, Punches
 from cotap.envs.randomization import RandomizationConfig, Randomizer
 from cotap.envs.reference import ReferenceConfig, ReferenceMotion
@@ -45,7 +48,7 @@ from cotap.robots import ROBOTS
 from cotap.robots.ground import HALF_EXTENT_M
 from cotap.robots.mjcf import COLLISIONS, FIXED_BASE_LIFT_M, build_model
 from cotap.rotations import quat_about_z, quat_from_matrix, rotate
-from cotap.sim import DelayedTargets, Simulation, Snapshot
+from cotap.sim import DelayedTargets, Snapshot, make_simulation, resolve_backend
 
 GRAVITY = 9.81
 
@@ -68,8 +71,11 @@ class H1EnvConfig:
     """Number of worlds."""
     seed: int = 0
     """Seed of the environment's own random numbers."""
+    backend: str = "auto"
+    """What simulates: mjbatch (the processor), warp (MuJoCo Warp; a graphics card if there is one), or auto: warp where
+    there are a graphics card and the extra `warp`, else mjbatch."""
     num_threads: int = 0
-    """Physics threads; 0 takes every processor."""
+    """Physics threads of mjbatch; 0 takes every processor."""
     collision: str = "feet"
     """feet (only feet meet the floor) or full."""
     control_dt: float = 0.02
@@ -102,6 +108,7 @@ class H1EnvConfig:
         require_positive_int("num_envs", self.num_envs)
         require_positive_int("substeps", self.substeps)
         require_one_of("robot", self.robot, ROBOTS.keys())
+        resolve_backend(self.backend)
         require_one_of("collision", self.collision, COLLISIONS)
         require_range("control_dt", self.control_dt, 1e-4, 1.0)
         require_range("torque_limit_scale", self.torque_limit_scale, 1e-3, 1e3)
@@ -142,20 +149,25 @@ class H1Env(VecEnv):
         self.cfg = cfg = cfg or H1EnvConfig()
         cfg.check()
         self._worlds_in_all = cfg.num_envs * require_positive_int("processes", processes)
-        self.device = "cpu"
-        self.num_envs = n = cfg.num_envs
+        self.num_envs = cfg.num_envs
         self.spec = spec = ROBOTS[cfg.robot]()
         self.num_actions = len(spec.joints)
         self.num_lower = len(spec.lower_joints)
         self.action_slices = {"lower": slice(0, self.num_lower), "upper": slice(self.num_lower, self.num_actions)}
-        self.rng = torch.Generator().manual_seed(cfg.seed)
-
         model = build_model(spec, cfg.collision, cfg.control_dt / cfg.substeps, cfg.fixed_base, cfg.unevenness_m)
         model.actuator_forcerange[:] *= cfg.torque_limit_scale
-        self.sim = Simulation(model, n, cfg.substeps, cfg.num_threads, Randomizer.FIELDS)
+        self.sim = make_simulation(cfg.backend, model, self.num_envs, cfg.substeps, cfg.num_threads, Randomizer.FIELDS)
+        self.device = self.sim.device
         self.dt = self.sim.dt
         self.max_episode_length = math.ceil(cfg.terminations.episode_s / self.dt)
+        self.rng = torch.Generator(self.device).manual_seed(cfg.seed)
+        with torch.device(self.device):  # where every part makes its tensors
+            self._assemble(model)
+        self.reset()
 
+    def _assemble(self, model: mujoco.MjModel) -> None:
+        """Make all parts and their tensors."""
+        cfg, spec, n = self.cfg, self.spec, self.num_envs
         joints = spec.joints
         self._default = torch.tensor([j.default_rad for j in joints])
         self._torque_limit = cfg.torque_limit_scale * torch.tensor([j.torque_limit_nm for j in joints])
@@ -170,8 +182,9 @@ class H1Env(VecEnv):
         self.reader = StateReader(spec, self.sim)
         self.arm_limits = self.reader.arm_joints(self._torque_limit.unsqueeze(0))[0]
         self._hand_bodies = [model.body(arm.hand_body).id for arm in spec.arms]
-        self._arm_links = [b for arm in spec.arms for b in spec.chain(arm.hand_body, spec.torso_body)]
-        self._arm_bodies = [model.body(link.name).id for link in self._arm_links]
+        arm_links = [b for arm in spec.arms for b in spec.chain(arm.hand_body, spec.torso_body)]
+        self._arm_bodies = [model.body(link.name).id for link in arm_links]
+        self._arm_coms = torch.tensor([link.com for link in arm_links])
         self._hand_lever = torch.stack(
             [torch.tensor(a.hand_point) - torch.tensor(spec.body(a.hand_body).com) for a in spec.arms]
         )
@@ -206,6 +219,7 @@ class H1Env(VecEnv):
             RewardGroup("upper", cfg.rewards.upper, self.dt),
         )
 
+        self._everyone = torch.ones(n, dtype=torch.bool)
         self.samples = 0
         self.num_diverged = 0
         self.episode_length_buf = torch.zeros(n, dtype=torch.long)
@@ -216,7 +230,6 @@ class H1Env(VecEnv):
         self._kp, self._kd = self.randomizer.gains()
         self.randomizer.randomize_bodies(self.rng)
         self.state: RobotState
-        self.reset()
 
     @property
     def obs_groups(self) -> dict[str, list[str]]:
@@ -254,17 +267,16 @@ class H1Env(VecEnv):
 
     def reset(self) -> TensorDict:
         """Restart every world and return the observations."""
-        everyone = torch.ones(self.num_envs, dtype=torch.bool)
-        self._restart(everyone)
-        self._observe(everyone)
+        self._restart(self._everyone)
+        self._observe(self._everyone)
         return self._observations
 
     def reset_alike(self, seed: int) -> TensorDict:
         """Restart every world with the same random numbers, so that all start in one state; return the observations."""
         for world in range(self.num_envs):
             self.rng.manual_seed(seed)
-            self._restart(torch.arange(self.num_envs) == world)
-        self._observe(torch.ones(self.num_envs, dtype=torch.bool))
+            self._restart(torch.arange(self.num_envs, device=self.device) == world)
+        self._observe(self._everyone)
         return self._observations
 
     def get_observations(self) -> TensorDict:
@@ -351,7 +363,7 @@ class H1Env(VecEnv):
         ruled = self.upper_body.active
         self.upper_body.set_law(world, arm, law)
         if ruled and not self.upper_body.active:  # actuators are the arms' own PD again
-            self.randomizer.write_gains(torch.ones(self.num_envs, dtype=torch.bool))
+            self.randomizer.write_gains(self._everyone)
             self._kp, self._kd = self.randomizer.gains()
 
     def arm_stiffness(self) -> torch.Tensor:
@@ -361,9 +373,9 @@ class H1Env(VecEnv):
         return torch.diag_embed(self.reader.arm_joints(self._kp))
 
     def state_dict(self) -> dict[str, Any]:
-        """All that the environment's future depends on."""
+        """All that the environment's future depends on, on the processor whatever the device."""
         snapshot = self.sim.snapshot()
-        return {
+        state = {
             "sim": {"state": snapshot.state, "sensors": snapshot.sensors, "fields": snapshot.fields},
             "parts": {name: part.state_dict() for name, part in self._parts().items()},
             "delay": {
@@ -378,9 +390,11 @@ class H1Env(VecEnv):
             "counters": {"samples": self.samples, "num_diverged": self.num_diverged},
             "rng": self.rng.get_state(),
         }
+        return on_processor(state)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on exactly where `state_dict` was taken. Raises ValueError for another number of worlds."""
+        """Go on exactly where `state_dict` was taken; on another kind of device or with another backend, with its own
+        arithmetic and random numbers. Raises ValueError for another number of worlds."""
         self.sim.restore(Snapshot(**state["sim"]))
         for name, part in self._parts().items():
             part.load_state_dict(state["parts"][name])
@@ -395,7 +409,8 @@ class H1Env(VecEnv):
         self._observations = TensorDict(saved, batch_size=[self.num_envs])
         self.samples = state["counters"]["samples"]
         self.num_diverged = state["counters"]["num_diverged"]
-        self.rng.set_state(state["rng"])
+        if state["rng"].shape == self.rng.get_state().shape:
+            self.rng.set_state(state["rng"].cpu())
         self.state = self.reader.read()
 
     def keep_in_step(self, mean: Callable[[torch.Tensor], torch.Tensor]) -> None:
@@ -484,11 +499,10 @@ class H1Env(VecEnv):
         s = self.state
         rotations_w = (s.torso_rotation_w[:, None, None] @ s.arms.rotations).flatten(1, 2)
         blows_w = self.punches.current()
-        for i, link in enumerate(self._arm_links):
+        for i, body in enumerate(self._arm_bodies):
             # The joint is the origin of the link's frame.
-            lever_w = -rotate(rotations_w[:, i], torch.tensor(link.com))
+            lever_w = -rotate(rotations_w[:, i], self._arm_coms[i])
             wrench = torch.cat((blows_w[:, i], torch.linalg.cross(lever_w, blows_w[:, i])), 1).double()
-            body = self._arm_bodies[i]
             self.sim.xfrc[:, body] = wrench + (self.sim.xfrc[:, body] if body in self._hand_bodies else 0.0)
 
     def _record(self, action: torch.Tensor, velocity_before: torch.Tensor, fell: torch.Tensor) -> StepRecord:
@@ -627,14 +641,14 @@ class H1Env(VecEnv):
         self.punches.reset(mask, self.rng)
         joints = self._default + uniform(self.rng, -0.05, 0.05, n, self.num_actions)
         joints[:, self.num_lower :] = self.motions.current().position[mask]
-        position = torch.zeros(n, 3)
+        position = torch.zeros(n, 3, device=self.device)
         position[:, 2] = self.spec.nominal_height_m + (FIXED_BASE_LIFT_M if self.cfg.fixed_base else 0.01)
         if self.cfg.unevenness_m > 0.0:
             position[:, :2] = uniform(self.rng, -0.5 * HALF_EXTENT_M, 0.5 * HALF_EXTENT_M, n, 2)
             position[:, 2] += 0.5 * self.cfg.unevenness_m
         yaw = uniform(self.rng, -math.pi, math.pi, n) * (not self.cfg.fixed_base)
         qpos = torch.cat((position, quat_about_z(yaw), joints), 1)
-        qvel = torch.cat((uniform(self.rng, -0.05, 0.05, n, 6), torch.zeros(n, self.num_actions)), 1)
+        qvel = torch.cat((uniform(self.rng, -0.05, 0.05, n, 6), torch.zeros_like(joints)), 1)
         self.sim.reset(mask, qpos, qvel)
         self.targets.reset(mask, joints)
         self._last_action[mask] = 0.0

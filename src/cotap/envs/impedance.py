@@ -98,7 +98,7 @@ class PathFollower(Stateful):
         if self.cfg.share == 0.0:
             return
         self.impedance.reset(mask)
-        self.active[mask] = torch.rand(int(mask.sum()), generator=rng) < self.cfg.share
+        self.active[mask] = torch.rand(int(mask.sum()), generator=rng, device=rng.device) < self.cfg.share
         self.target_w = torch.where(mask.unsqueeze(1), position_w, self.target_w)
         self.heading = torch.where(mask, _yaw(heading_w), self.heading)
 

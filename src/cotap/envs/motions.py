@@ -87,7 +87,7 @@ class MotionGenerator(Stateful):
 
     def hold(self, pose: torch.Tensor) -> None:
         """Hold `pose` (U,) or (N, U) in all worlds until further notice."""
-        self._start = pose.expand_as(self._start).clone()
+        self._start = pose.to(self._start.device).expand_as(self._start).clone()
         self._goal = self._start.clone()
         self._amplitude.zero_()
         self._fixed = True
@@ -135,12 +135,14 @@ class MotionGenerator(Stateful):
         start = torch.where(self._out_and_back[mask, None] > 0.5, self._start[mask], self._goal[mask])
         kind = torch.multinomial(self._weights, n, replacement=True, generator=rng)
         is_kind = {name: (kind == i).float().unsqueeze(1) for i, name in enumerate(KINDS)}
-        goal = self._low + (self._high - self._low) * torch.rand(n, u, generator=rng)
+        goal = self._low + (self._high - self._low) * torch.rand(n, u, generator=rng, device=rng.device)
         goal = start + (goal - start) * (is_kind["reach"] + is_kind["punch"])
         # Some reaches and all punches move one arm only.
-        arm = torch.randint(0, u // self._joints_per_arm, (n, 1), generator=rng)
-        own = (torch.arange(u) // self._joints_per_arm == arm).float()
-        single = torch.maximum(is_kind["punch"], (torch.rand(n, 1, generator=rng) < 0.5).float() * is_kind["reach"])
+        arm = torch.randint(0, u // self._joints_per_arm, (n, 1), generator=rng, device=rng.device)
+        own = (torch.arange(u, device=rng.device) // self._joints_per_arm == arm).float()
+        single = torch.maximum(
+            is_kind["punch"], (torch.rand(n, 1, generator=rng, device=rng.device) < 0.5).float() * is_kind["reach"]
+        )
         goal = start + (goal - start) * torch.where(single > 0.5, own, torch.ones_like(own))
         amplitude = self._oscillation(start, is_kind, rng)
         fastest = torch.maximum((goal - start).abs() / self._speed, torch.zeros_like(goal)).amax(1) * PEAK_SPEED
@@ -149,7 +151,7 @@ class MotionGenerator(Stateful):
         duration = (fastest * legs * slack).clamp_min(0.5)
         oscillates = (is_kind["wave"] + is_kind["swing"]).squeeze(1) > 0.5
         duration = torch.where(oscillates, uniform(rng, 2.0, 5.0, n), duration)
-        cycles = torch.where(oscillates, (duration * uniform(rng, 0.5, 1.8, n)).round(), torch.zeros(n))
+        cycles = torch.where(oscillates, (duration * uniform(rng, 0.5, 1.8, n)).round(), torch.zeros_like(duration))
         # The oscillation's speed is at most amplitude * pi (2 cycles + 1) / duration.
         peak = math.pi * (2.0 * cycles + 1.0) / duration
         amplitude = amplitude.sign() * torch.minimum(amplitude.abs(), self._speed / peak.unsqueeze(1))
@@ -161,10 +163,10 @@ class MotionGenerator(Stateful):
         """Signed amplitudes (n, U) that keep within the limits around `start`."""
         n, u = start.shape
         room = torch.minimum(start - self._low, self._high - start).clamp_min(0.0)
-        chosen = (torch.rand(n, u, generator=rng) < 0.4).float()
+        chosen = (torch.rand(n, u, generator=rng, device=rng.device) < 0.4).float()
         wave = chosen * uniform(rng, -0.8, 0.8, n, u)
         # The first joint of each arm swings, each arm against the one before.
-        index = torch.arange(u)
+        index = torch.arange(u, device=rng.device)
         sign = 1.0 - 2.0 * ((index // self._joints_per_arm) % 2).float()
         swing = sign * (index % self._joints_per_arm == 0) * uniform(rng, 0.2, 0.6, n, 1)
         amplitude = wave * is_kind["wave"] + swing * is_kind["swing"]

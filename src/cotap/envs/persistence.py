@@ -27,13 +27,25 @@ class Stateful:
 
 
 def restored(name: str, value: Any, like: torch.Tensor) -> torch.Tensor:
-    """A copy of `value`, which was saved where `like` is now. Raises ValueError for another kind, size or type."""
+    """A copy of `value`, which was saved where `like` is now, on its device.
+
+    Raises ValueError for another kind, size or type.
+    """
     if not isinstance(value, torch.Tensor) or value.dtype != like.dtype:
         kind = value.dtype if isinstance(value, torch.Tensor) else type(value).__name__
         raise ValueError(f"{name} must be a tensor of {like.dtype}, got {kind}")
-    return require_shape(name, value, tuple(like.shape)).clone()
+    return require_shape(name, value, tuple(like.shape)).to(like.device, copy=True)
+
+
+def on_processor(state: Any) -> Any:
+    """`state`, dicts and lists of tensors and plain data, with every tensor on the processor."""
+    if isinstance(state, torch.Tensor):
+        return state.cpu()
+    if isinstance(state, dict):
+        return {name: on_processor(value) for name, value in state.items()}
+    return [on_processor(value) for value in state] if isinstance(state, list) else state
 
 
 def uniform(rng: torch.Generator, low: float, high: float, *shape: int) -> torch.Tensor:
-    """Uniform random numbers in [low, high) of the given shape."""
-    return torch.rand(*shape, generator=rng).mul_(high - low).add_(low)
+    """Uniform random numbers in [low, high) of the given shape, on the generator's device."""
+    return torch.rand(*shape, generator=rng, device=rng.device).mul_(high - low).add_(low)

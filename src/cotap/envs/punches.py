@@ -49,9 +49,9 @@ class Punches(Stateful):
         if not self.active or n == 0:
             return
         cfg = self.cfg
-        direction = torch.nn.functional.normalize(torch.randn(n, 3, generator=rng), dim=1)
+        direction = torch.nn.functional.normalize(torch.randn(n, 3, generator=rng, device=rng.device), dim=1)
         self._force_w[mask] = direction * uniform(rng, 0.0, cfg.force_n, n, 1)
-        self.joint[mask] = torch.randint(0, self._num_joints, (n,), generator=rng)
+        self.joint[mask] = torch.randint(0, self._num_joints, (n,), generator=rng, device=rng.device)
         self._start_s[mask] = uniform(rng, 0.0, cfg.segment_s - cfg.duration_s, n)
         self._left_s[mask] = cfg.segment_s
 

@@ -72,13 +72,13 @@ class Randomizer(Stateful):
     def set_mass(self, scale: torch.Tensor, added_kg: torch.Tensor) -> None:
         """Give every world's links their nominal mass and inertia times `scale` (N, bodies), the base more (N,)."""
         mass, inertia = self._sim.field("body_mass"), self._sim.field("body_inertia")
-        nominal = torch.from_numpy(self._sim.model.body_mass)
+        nominal = torch.as_tensor(self._sim.model.body_mass, device=mass.device)
         scaled = nominal * scale.double()
         # Mass added to the base is spread as the base's own.
         scaled[:, self._base] += added_kg.double()
         ratio = torch.where(nominal > 0.0, scaled / nominal.clamp_min(1e-12), torch.ones_like(scaled))
         mass.copy_(scaled)
-        inertia.copy_(torch.from_numpy(self._sim.model.body_inertia) * ratio.unsqueeze(-1))
+        inertia.copy_(torch.as_tensor(self._sim.model.body_inertia, device=mass.device) * ratio.unsqueeze(-1))
         self._sim.update_constants()
 
     def randomize_episode(self, mask: torch.Tensor, delay_s: torch.Tensor, rng: torch.Generator) -> None:
@@ -97,13 +97,13 @@ class Randomizer(Stateful):
         """Give the feet in the worlds of `mask` (N,) the sliding friction `sliding` (n,)."""
         friction = self._sim.field("geom_friction")
         for geom in self._foot_geoms:
-            friction[mask, geom, 0] = sliding.double()
+            friction[mask, geom, 0] = sliding.to(friction)
 
     def write_gains(self, mask: torch.Tensor) -> None:
         """Bring the actuators' gains of the worlds in `mask` in line with the scales."""
         bias = self._sim.field("actuator_biasprm")
-        bias[mask, :, 1] = -self._kp * self.kp_scale[mask].double()
-        bias[mask, :, 2] = -self._kd * self.kd_scale[mask].double()
+        bias[mask, :, 1] = (-self._kp * self.kp_scale[mask].double()).to(bias)
+        bias[mask, :, 2] = (-self._kd * self.kd_scale[mask].double()).to(bias)
 
     def gains(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Present kp [Nm/rad] and kd [Nms/rad] of every joint, (N, J) each."""

@@ -129,7 +129,7 @@ class ReferenceMotion(Stateful):
     def hold(self, pose: torch.Tensor) -> None:
         """Hold `pose` (U,) or (N, U) in all worlds until further notice."""
         self._fixed = True
-        self._position = pose.expand_as(self._position).clone()
+        self._position = pose.to(self._position.device).expand_as(self._position).clone()
         self._velocity = torch.zeros_like(self._velocity)
 
     def reset(self, mask: torch.Tensor, rng: torch.Generator) -> None:
@@ -162,7 +162,7 @@ class ReferenceMotion(Stateful):
     def root_velocity(self) -> torch.Tensor:
         """Root velocity (N, 3) of the clip that a world plays: forward, leftward [m/s], turning [rad/s]; else zero."""
         if self.clips is None:
-            return torch.zeros(self._from_clip.shape[0], 3)
+            return torch.zeros(self._from_clip.shape[0], 3, device=self._position.device)
         return self.clips.root_velocity() * self._from_clip.unsqueeze(1)
 
     def state_dict(self) -> dict[str, Any]:
@@ -187,7 +187,7 @@ class ReferenceMotion(Stateful):
         n = int(mask.sum())
         self._remaining_s[mask] = uniform(rng, *self.cfg.hold_s, n)
         if self.clips:
-            self._from_clip[mask] = torch.rand(n, generator=rng) < self.cfg.share
+            self._from_clip[mask] = torch.rand(n, generator=rng, device=rng.device) < self.cfg.share
             self.clips.draw(mask, rng)
 
     def _begin(self, mask: torch.Tensor, motion: str) -> None:

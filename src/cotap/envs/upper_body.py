@@ -175,7 +175,7 @@ class UpperBody(Stateful):
         low, high = (math.log(bound) for bound in cfg.stiffness)
         p.stiffness[mask] = uniform(rng, low, high, n, arms, 3).exp()
         p.null_stiffness[mask] = uniform(rng, *cfg.null_stiffness, n, arms)
-        full = torch.rand(n, arms, generator=rng) < cfg.full_alpha
+        full = torch.rand(n, arms, generator=rng, device=rng.device) < cfg.full_alpha
         p.alpha[mask] = torch.where(full, cfg.alpha[1], uniform(rng, *cfg.alpha, n, arms))
         self._hold_s[mask] = uniform(rng, *cfg.hold_s, n)
 
@@ -258,7 +258,7 @@ class UpperBody(Stateful):
         if len(memories) != len(remembering):
             raise ValueError(f"the arms' laws remember {len(remembering)} states, got {len(memories)}")
         for law, memory in zip(remembering, memories, strict=True):
-            law.memory = {k: v.clone() for k, v in memory.items()}
+            law.memory = {k: v.to(self.fresh.device, copy=True) for k, v in memory.items()}
         super().load_state_dict(own)
         self.parameters = LawParameters(**parameters)
 
@@ -281,7 +281,7 @@ class UpperBody(Stateful):
         """The arms (N, A) under laws of one kind, to write to; none at first."""
         kind = law.kind()
         if kind not in self._laws:
-            nobody = torch.zeros(self._shape[:2], dtype=torch.bool)
+            nobody = torch.zeros(self._shape[:2], dtype=torch.bool, device=self.arms.kp.device)
             built = law if self._cfg.singularity_ratio else replace(law, condition_threshold=math.inf)
             self._laws[kind] = (LAWS[law.name](self.arms, built), law, nobody)
         return self._laws[kind][2]

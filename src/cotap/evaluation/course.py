@@ -33,16 +33,20 @@ class Course:
         radius: Distance at which one is reached [m].
         num_envs: N.
         rng: Draws the turns.
+        device: Where the worlds are.
     """
 
-    def __init__(self, count: int, leg: float, turn: float, radius: float, num_envs: int, rng: torch.Generator) -> None:
-        direction = uniform(rng, -turn, turn, num_envs, count).cumsum(1)
+    def __init__(
+        self, count: int, leg: float, turn: float, radius: float, num_envs: int, rng: torch.Generator,
+        device: torch.device | str = "cpu",
+    ) -> None:  # fmt: skip
+        direction = uniform(rng, -turn, turn, num_envs, count).cumsum(1).to(device)
         self._legs = leg * torch.stack((direction.cos(), direction.sin(), torch.zeros_like(direction)), 2)
         self._radius = radius
-        self._points_w = torch.zeros(num_envs, count, 2)
-        self.reached = torch.zeros(num_envs, dtype=torch.long)
+        self._points_w = torch.zeros(num_envs, count, 2, device=device)
+        self.reached = torch.zeros(num_envs, dtype=torch.long, device=device)
         """(N,) how many waypoints each world has reached."""
-        self.over = torch.zeros(num_envs, dtype=torch.bool)
+        self.over = torch.zeros(num_envs, dtype=torch.bool, device=device)
         """(N,) worlds that reach no more."""
 
     def start(self, position_w: torch.Tensor, heading_w: torch.Tensor) -> None:

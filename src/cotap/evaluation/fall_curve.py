@@ -56,7 +56,7 @@ class FallCurve(Impact):
         """Give every world its blow."""
         super().prepare(env)
         force = self.impulses()[self._level()] / (self.duration * math.hypot(*self.force))
-        env.scripted.amplitude_h = env.scripted.amplitude_h * force[:, None, None]
+        env.scripted.amplitude_h = env.scripted.amplitude_h * force[:, None, None].to(env.device)
 
     def _level(self) -> torch.Tensor:
         """(N,) which impulse each world takes."""

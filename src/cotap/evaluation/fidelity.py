@@ -161,7 +161,7 @@ def _torque_share(env: H1Env, pose: torch.Tensor, side: int, force: torch.Tensor
     up = torch.tensor([0.0, 0.0, 1.0]).expand(len(pose), 3)
     needed = gravity_torque(arm_inertias(env.spec), at, up)[:, side]
     needed = needed - (chains.jacobian(at)[:, side].transpose(-1, -2) @ force.unsqueeze(-1)).squeeze(-1)
-    return (needed.abs() / env.arm_limits[side]).amax(1)
+    return (needed.abs() / env.arm_limits[side].cpu()).amax(1)
 
 
 def summary(result: FidelityResult, coverage: float, protocol: Fidelity) -> dict[str, Any]:

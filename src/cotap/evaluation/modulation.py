@@ -54,13 +54,15 @@ class Modulation(ConstantLoad):
         if not env.upper_body.active:
             raise ValueError("modulation needs a law with a stiffness, such as --method cotap; got pd on both arms")
         rng = torch.Generator().manual_seed(self.seed)
-        self.phase = torch.rand(env.num_envs, len(env.spec.arms), 2, generator=rng)
+        self.phase = torch.rand(env.num_envs, len(env.spec.arms), 2, generator=rng).to(env.device)
 
     def before_step(self, env: H1Env, step: int) -> None:
         """Set stiffness and alpha of this step."""
-        cycles = step * env.dt / self.period * torch.tensor([1.0, 2.0 / (1.0 + math.sqrt(5.0))]) + self.phase
+        pace = torch.tensor([1.0, 2.0 / (1.0 + math.sqrt(5.0))], device=env.device)
+        cycles = step * env.dt / self.period * pace + self.phase
         stepped = {"step": True, "ramp": False}.get(self.change)
-        mask = torch.arange(env.num_envs) % 2 == 0 if stepped is None else torch.full((env.num_envs,), stepped)
+        number = torch.arange(env.num_envs, device=env.device)
+        mask = number % 2 == 0 if stepped is None else torch.full_like(number, stepped, dtype=torch.bool)
         stiffness, alpha = sweep(cycles, mask[:, None, None]).unbind(2)
         low, high = (math.log(bound) for bound in self.stiffness_range)
         p = env.upper_body.parameters

@@ -50,6 +50,11 @@ class Policy:
     config: dict[str, Any]
     stage: str
 
+    def to(self, device: torch.device | str) -> Policy:
+        """The same policy, its networks moved to `device`."""
+        self.model.to(device)
+        return self
+
     @torch.no_grad()
     def __call__(self, observations: dict[str, torch.Tensor]) -> torch.Tensor:
         """Deterministic actions (N, A) of raw observations."""

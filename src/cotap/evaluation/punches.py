@@ -72,7 +72,7 @@ class PunchWalk(Scenario):
         """Lay out the waypoints."""
         super().prepare(env)
         rng = torch.Generator().manual_seed(self.seed)
-        self.course = Course(self.waypoints, self.leg, self.turn, self.radius, env.num_envs, rng)
+        self.course = Course(self.waypoints, self.leg, self.turn, self.radius, env.num_envs, rng, env.device)
 
     def before_step(self, env: H1Env, step: int) -> None:
         """Steer towards the next waypoint."""
@@ -85,17 +85,18 @@ class PunchWalk(Scenario):
         velocity, yaw_rate = steer(ahead, self.speed)
         done = self.course.reached >= self.waypoints
         n = env.num_envs
-        stand, height = done.float(), torch.full((n,), env.spec.nominal_height_m)
+        stand, height = done.float(), torch.full((n,), env.spec.nominal_height_m, device=env.device)
         env.commands.override(velocity * ~done.unsqueeze(1), yaw_rate * ~done, stand, height)
 
     def measure(self, trajectory: Trajectory, env: H1Env) -> dict[str, Any]:
         """The measured part of the evaluation's JSON."""
         t = trajectory
         fell = t.fell.any(0)
-        completed = (self.course.reached >= self.waypoints) & ~fell
+        reached = self.course.reached.cpu()
+        completed = (reached >= self.waypoints) & ~fell
         measures = {
             "completed_fraction": completed,
-            "waypoints_reached": self.course.reached.float(),
+            "waypoints_reached": reached.float(),
             "seconds_upright": t.alive().float().sum(0) * t.dt,
             **window_measures(t, 0, len(t.fell), list(range(len(env.spec.arms)))),
         }

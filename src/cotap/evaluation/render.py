@@ -156,7 +156,7 @@ def contact_sheet(path: Path, frames: list[np.ndarray], columns: int) -> None:
 
 def record_tour(cfg: H1EnvConfig, policy: PolicyFunction, seed: int = 0) -> tuple[H1Env, torch.Tensor]:
     """One nominal robot on the tour. Returns the environment and its `qpos` (T, nq) at every control step."""
-    cfg.num_envs, cfg.seed = 1, seed
+    cfg.num_envs, cfg.seed, cfg.backend = 1, seed, "mjbatch"
     cfg.randomization.enabled = cfg.hand_forces.enabled = cfg.blows.enabled = cfg.assist.enabled = False
     cfg.terminations.episode_s, cfg.commands.steady_rad = 1e4, STEADY_RAD
     env = H1Env(cfg)

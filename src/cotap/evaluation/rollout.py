@@ -83,7 +83,7 @@ def record_rollout(
 
     Args:
         env: The worlds.
-        policy: Actions of observations.
+        policy: Actions of observations, on the worlds' device; what is recorded is on the processor.
         steps: Number of control steps.
         progress: Whether to show a progress bar.
         arm_actions: With False, what the policy does with the arms is left out.
@@ -96,7 +96,7 @@ def record_rollout(
     for step in tqdm(range(steps), desc="rollout", unit="step", disable=None if progress else True, leave=False):
         if before_step:
             before_step(env, step)
-        action = policy(as_dict(obs))
+        action = policy(as_dict(obs, env.device))
         if not arm_actions:
             action = action.clone()
             action[:, env.action_slices["upper"]] = 0.0
@@ -105,7 +105,8 @@ def record_rollout(
             record.setdefault(name, value.new_empty((steps, *value.shape)))[step] = value
         if film:
             frames.append(_frame(env))
-    return Trajectory(dt=env.dt, film=torch.stack(frames) if frames else torch.zeros(0, 0), **record)
+    seen = torch.stack(frames).cpu() if frames else torch.zeros(0, 0)
+    return Trajectory(dt=env.dt, film=seen, **{name: value.cpu() for name, value in record.items()})
 
 
 def _frame(env: H1Env) -> torch.Tensor:
@@ -117,7 +118,7 @@ def _frame(env: H1Env) -> torch.Tensor:
 
 def idle(env: H1Env) -> PolicyFunction:
     """A policy that does nothing."""
-    return lambda _: torch.zeros(env.num_envs, env.num_actions)
+    return lambda _: torch.zeros(env.num_envs, env.num_actions, device=env.device)
 
 
 def arm_static_torque(arms: Arms, s: RobotState, force_w: torch.Tensor) -> torch.Tensor:

@@ -122,14 +122,14 @@ class SwingingForces:
 
     active = True
 
-    def __init__(self, protocol: Stability, num_hands: int, rng: torch.Generator) -> None:
+    def __init__(self, protocol: Stability, num_hands: int, rng: torch.Generator, device: torch.device | str) -> None:
         n = protocol.num_envs
         direction = torch.randn(n, num_hands, 3, generator=rng)
         amplitude = protocol.force * direction / direction.norm(dim=-1, keepdim=True)
         low, high = (math.log(bound) for bound in protocol.frequency)
         rate = 2.0 * math.pi * uniform(rng, low, high, n, num_hands, 1).exp()
         # The base, last, is left alone.
-        self._amplitude, self._rate = (torch.nn.functional.pad(x, (0, 0, 0, 1)) for x in (amplitude, rate))
+        self._amplitude, self._rate = (torch.nn.functional.pad(x, (0, 0, 0, 1)).to(device) for x in (amplitude, rate))
         self._start_s = protocol.settle_seconds
 
     def reset(self, mask: torch.Tensor, rng: torch.Generator) -> None:
@@ -150,19 +150,19 @@ def exchanged_energy(env: H1Env, protocol: Stability) -> torch.Tensor:
     """
     rng = torch.Generator().manual_seed(protocol.seed)
     env.motions.hold(random_poses(env.spec, env.num_envs, rng).flatten(1) * 0.5)
-    forces = SwingingForces(protocol, len(env.spec.arms), rng)
+    forces = SwingingForces(protocol, len(env.spec.arms), rng, env.device)
     env.scripted = forces  # pyright: ignore[reportAttributeAccessIssue]
     env.reset()
     stiffness = env.upper_body.parameters.stiffness.clone()
-    changing = torch.arange(env.num_envs) >= env.num_envs // 2
+    changing = torch.arange(env.num_envs, device=env.device) >= env.num_envs // 2
     hold = round(protocol.change_seconds / env.dt)
-    energy = torch.zeros(env.num_envs)
+    energy = torch.zeros(env.num_envs, device=env.device)
     rows = []
-    action = torch.zeros(env.num_envs, env.num_actions)
+    action = torch.zeros(env.num_envs, env.num_actions, device=env.device)
     settle = round(protocol.settle_seconds / env.dt)
     for step in range(settle + round(protocol.seconds / env.dt)):
         if step >= settle and (step - settle) % hold == 0:
-            draw = uniform(rng, -0.5, 0.5, *stiffness.shape)
+            draw = uniform(rng, -0.5, 0.5, *stiffness.shape).to(env.device)
             changed = stiffness * protocol.change_factor**draw
             env.upper_body.parameters.stiffness = torch.where(changing[:, None, None], changed, stiffness)
         before = _hands_w(env)
@@ -173,7 +173,7 @@ def exchanged_energy(env: H1Env, protocol: Stability) -> torch.Tensor:
         energy = energy + torch.nan_to_num(work, nan=-math.inf, posinf=-math.inf)
         if step >= settle:
             rows.append(energy.clone())
-    return torch.stack(rows)
+    return torch.stack(rows).cpu()
 
 
 def _hands_w(env: H1Env) -> torch.Tensor:

@@ -15,7 +15,7 @@ from cotap.compliance import condition_number
 from cotap.envs import H1Env, H1EnvConfig
 from cotap.envs.commands import STEADY_RAD
 from cotap.evaluation.report import save_figure
-from cotap.evaluation.rollout import PolicyFunction
+from cotap.evaluation.rollout import PolicyFunction, idle
 from cotap.evaluation.scenario import PELVIS, mirrored_pose
 
 
@@ -105,7 +105,7 @@ class StaticResult:
 
 @dataclass(frozen=True)
 class Settled:
-    """What a load that is held does to N hands."""
+    """What a load that is held does to N hands; on the processor."""
 
     moved: torch.Tensor
     """(N, 3) displacement against the torso, heading frame [m]."""
@@ -127,16 +127,16 @@ def settle(env: H1Env, policy: PolicyFunction | None, seconds: float, side: int,
         side: Which hand is looked at.
         arm_actions: Whether the policy's own arm actions count.
     """
-    obs = env.reset()
-    fell = torch.zeros(env.num_envs, dtype=torch.bool)
+    obs, act = env.reset(), policy or idle(env)
+    fell = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
     averages: list[torch.Tensor] = []
     steps, window = round(seconds / env.dt), round(1.0 / env.dt)
-    rotation = torch.zeros(env.num_envs, 3, 3)
-    condition = torch.zeros(env.num_envs)
+    rotation = torch.zeros(env.num_envs, 3, 3, device=env.device)
+    condition = torch.zeros(env.num_envs, device=env.device)
     for begin in (0, steps):  # without the load, then with it
-        total = torch.zeros(env.num_envs, 3)
+        total = torch.zeros(env.num_envs, 3, device=env.device)
         for step in range(steps):
-            action = torch.zeros(env.num_envs, env.num_actions) if policy is None else policy(as_dict(obs)).clone()
+            action = act(as_dict(obs, env.device)).clone()
             if not arm_actions:
                 action[:, env.action_slices["upper"]] = 0.0
             obs, _, _, extras = env.step(action)
@@ -150,14 +150,15 @@ def settle(env: H1Env, policy: PolicyFunction | None, seconds: float, side: int,
             condition = condition_number(env.reader.arm_chains.jacobian(s.arms)[:, side])
     moved = (rotation @ (averages[1] - averages[0]).unsqueeze(-1)).squeeze(-1)
     torque = env.record.torque[:, env.action_slices["upper"]].unflatten(1, (len(env.spec.arms), -1))[:, side]
-    return Settled(moved, condition, fell, (torque.abs() > 0.999 * env.arm_limits[side]).any(1))
+    saturated = (torque.abs() > 0.999 * env.arm_limits[side]).any(1)
+    return Settled(moved.cpu(), condition.cpu(), fell.cpu(), saturated.cpu())
 
 
 def measure(env: H1Env, protocol: StaticStiffness, policy: PolicyFunction | None) -> StaticResult:
     """Run the protocol in `env`, made from its config."""
     side = [arm.side for arm in env.spec.arms].index(protocol.hand)
     levels = torch.linspace(0.0, 1.0, protocol.levels).repeat_interleave(protocol.repeats)
-    env.scripted.amplitude_h = env.scripted.amplitude_h * levels[:, None, None]
+    env.scripted.amplitude_h = env.scripted.amplitude_h * levels[:, None, None].to(env.device)
     env.motions.hold(mirrored_pose(env, protocol.arm_pose))
     settled = settle(
         env, policy if protocol.pelvis == "free" else None, protocol.settle_seconds, side, protocol.arm_actions

@@ -47,4 +47,5 @@ class MisjudgingUpperBody(UpperBody):
 def misjudge(env: H1Env, length: float, mass: float) -> None:
     """From now on the laws of `env` take the arms for longer and heavier by these factors than they are."""
     believed = misjudged_arms(env.spec, length, mass)
-    env.upper_body = MisjudgingUpperBody(env.cfg.upper_body, believed, env.num_envs, env.dt)
+    with torch.device(env.device):
+        env.upper_body = MisjudgingUpperBody(env.cfg.upper_body, believed, env.num_envs, env.dt)

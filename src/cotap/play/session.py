@@ -206,7 +206,7 @@ class Session:
 
 def play_config(env: H1EnvConfig) -> H1EnvConfig:
     """Turn the environment that a policy was trained in into the page's. Changes and returns `env`."""
-    env.num_envs, env.num_threads = len(ROBOTS), 1
+    env.num_envs, env.num_threads, env.backend = len(ROBOTS), 1, "mjbatch"
     env.assist.enabled = env.hand_forces.enabled = env.blows.enabled = env.randomization.enabled = False
     env.observations.noise.enabled = False
     env.terminations.episode_s = 1e6

@@ -1,6 +1,16 @@
 """Batched physics: stepping, per-world model fields, wrenches, snapshots; knows nothing of control laws."""
 
 from cotap.sim.actuation import DelayedTargets
+from cotap.sim.backends import BACKENDS, make_simulation, resolve_backend
+from cotap.sim.batch_simulation import BatchSimulation
 from cotap.sim.simulation import Simulation, Snapshot
 
-__all__ = ["DelayedTargets", "Simulation", "Snapshot"]
+__all__ = [
+    "BACKENDS",
+    "BatchSimulation",
+    "DelayedTargets",
+    "Simulation",
+    "Snapshot",
+    "make_simulation",
+    "resolve_backend",
+]

@@ -1,15 +1,15 @@
-"""A batch of MuJoCo worlds on mjbatch, seen as torch tensors that share its memory."""
+"""A batch of MuJoCo worlds as torch tensors that share the simulator's memory: what every backend has in common."""
 
 from __future__ import annotations
 
 # MuJoCo's extension module has no type stubs.
 # pyright: reportAttributeAccessIssue=false
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import mujoco
 import torch
-from mjbatch import Batch
 
 from cotap.checks import require_positive_int, require_shape
 
@@ -19,18 +19,21 @@ DriveFunction = Callable[[int], torch.Tensor]
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Everything that the worlds' future depends on: integration states, sensors, expanded model fields."""
+    """Everything that the worlds' future depends on: integration states, sensors, expanded model fields.
+
+    States are in the order of MuJoCo's mjSTATE_INTEGRATION whatever the backend, so that one may go on from another's.
+    """
 
     state: torch.Tensor
     sensors: torch.Tensor
     fields: dict[str, torch.Tensor]
 
 
-class Simulation:
+class Simulation(ABC):
     """N worlds of one model.
 
-    State tensors (`qpos`, `qvel`, `ctrl`, `xfrc`) are float64 views into the simulator's own memory: write to them and
-    the next step starts from there. `sensors` is a float32 copy-out.
+    State tensors (`qpos`, `qvel`, `ctrl`, `xfrc`) are views into the simulator's own memory, in its own precision:
+    write to them and the next step starts from there. So are the tensors of `field`. `sensors` (float32) is to be read.
 
     Staleness: after `step`, `qpos` and `qvel` are current, `sensors` are one physics step behind (as with `mj_step`).
     After `reset`, all are current.
@@ -39,24 +42,27 @@ class Simulation:
         model: Compiled model; copied.
         num_envs: Number of worlds.
         substeps: Physics steps per control step.
-        num_threads: Worker threads; 0 takes every processor.
-        fields: Names of `mjModel` fields that are to differ between worlds.
     """
 
-    def __init__(
-        self, model: mujoco.MjModel, num_envs: int, substeps: int, num_threads: int = 0, fields: tuple[str, ...] = ()
-    ) -> None:
+    device: str
+    """Where all tensors are."""
+    qpos: torch.Tensor
+    """(num_envs, nq)."""
+    qvel: torch.Tensor
+    """(num_envs, nv)."""
+    ctrl: torch.Tensor
+    """(num_envs, nu)."""
+    xfrc: torch.Tensor
+    """(num_envs, nbody, 6) force [N] and torque [Nm] on every body, at its centre of mass, world frame."""
+    sensors: torch.Tensor
+    """(num_envs, nsensordata)."""
+    _fields: dict[str, torch.Tensor]
+
+    def __init__(self, model: mujoco.MjModel, num_envs: int, substeps: int) -> None:
         self.num_envs = require_positive_int("num_envs", num_envs)
         self.substeps = require_positive_int("substeps", substeps)
         self.model = model
         self.dt = float(model.opt.timestep) * substeps
-        self._batch = Batch(model, num_envs, num_threads)
-        self._state = torch.from_numpy(self._batch.bind("state"))
-        self.qpos, self.qvel, self.ctrl, self.xfrc = (
-            torch.from_numpy(self._batch.bind(name)) for name in ("qpos", "qvel", "ctrl", "xfrc_applied")
-        )
-        self.sensors = torch.from_numpy(self._batch.bind("sensordata", "float32"))
-        self._fields = {name: torch.from_numpy(self._batch.expand(name)) for name in fields}
 
     def field(self, name: str) -> torch.Tensor:
         """Per-world values of an `mjModel` field named at construction, (num_envs, ...), to write in place.
@@ -73,15 +79,15 @@ class Simulation:
         sensor = self.model.sensor(name)
         return self.sensors[:, sensor.adr[0] : sensor.adr[0] + sensor.dim[0]]
 
+    @abstractmethod
     def update_constants(self) -> None:
         """Recompute what MuJoCo derives from masses and inertias, per world. Call after writing such fields."""
-        self._batch.set_const()
 
     def step(self, drive: DriveFunction) -> None:
         """Advance every world by one control step, asking `drive` for `ctrl` before every physics step."""
         for k in range(self.substeps):
             self.ctrl.copy_(drive(k))
-            self._batch.step()
+            self._advance()
 
     def reset(self, mask: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
         """Restart the worlds in `mask` (num_envs,) bool from `qpos` (n, nq) and `qvel` (n, nv), n = mask.sum().
@@ -92,10 +98,9 @@ class Simulation:
         ids = mask.nonzero().squeeze(1)
         if ids.numel() == 0:
             return
-        self._batch.reset(mask.numpy())
-        self.qpos[ids] = qpos.double()
-        self.qvel[ids] = qvel.double()
-        self._batch.forward(mask.numpy())
+        self._clear(mask)
+        self.qpos[ids], self.qvel[ids] = qpos.to(self.qpos), qvel.to(self.qvel)
+        self._forward(mask)
 
     def apply_force(self, body: int, force_w: torch.Tensor, lever_w: torch.Tensor) -> None:
         """Apply `force_w` (num_envs, 3) [N] to body number `body` at `lever_w` from its centre of mass, world frame.
@@ -108,21 +113,46 @@ class Simulation:
     def snapshot(self) -> Snapshot:
         """Copy of everything that the future depends on."""
         return Snapshot(
-            self._state.clone(), self.sensors.clone(), {name: value.clone() for name, value in self._fields.items()}
+            self._read_state(), self.sensors.clone(), {name: value.clone() for name, value in self._fields.items()}
         )
 
     def restore(self, snapshot: Snapshot) -> None:
-        """Go on from a snapshot of a simulation with the same model, size and fields.
+        """Go on from a snapshot of a simulation with the same model, size and fields, of whatever backend and device.
 
         Raises:
             ValueError: sizes or fields differ.
         """
-        require_shape("snapshot.state", snapshot.state, tuple(self._state.shape))
+        require_shape("snapshot.state", snapshot.state, (self.num_envs, state_size(self.model)))
         if snapshot.fields.keys() != self._fields.keys():
             raise ValueError(f"snapshot has fields {sorted(snapshot.fields)}, not {sorted(self._fields)}")
         for name, value in snapshot.fields.items():
             self._fields[name].copy_(require_shape(f"snapshot.fields[{name}]", value, tuple(self._fields[name].shape)))
         if {"body_mass", "body_inertia"} & self._fields.keys():
             self.update_constants()
-        self._state.copy_(snapshot.state)
+        self._write_state(snapshot.state)
         self.sensors.copy_(snapshot.sensors)
+
+    @abstractmethod
+    def _advance(self) -> None:
+        """One physics step of every world."""
+
+    @abstractmethod
+    def _clear(self, mask: torch.Tensor) -> None:
+        """Put the worlds of `mask` (num_envs,) back to the model's initial state, without forces and controls."""
+
+    @abstractmethod
+    def _forward(self, mask: torch.Tensor) -> None:
+        """Make everything that follows from the state current in the worlds of `mask` (num_envs,), and in no other."""
+
+    @abstractmethod
+    def _read_state(self) -> torch.Tensor:
+        """Copy of the integration states (num_envs, state_size)."""
+
+    @abstractmethod
+    def _write_state(self, state: torch.Tensor) -> None:
+        """Take over integration states (num_envs, state_size)."""
+
+
+def state_size(model: mujoco.MjModel) -> int:
+    """Numbers in a world's integration state."""
+    return mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_INTEGRATION)

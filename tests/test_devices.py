@@ -1,0 +1,36 @@
+"""Training and evaluation with worlds on a device that is not the processor: the same numbers, nothing forgotten."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from elsewhere import elsewhere
+
+from cotap.evaluate import evaluate
+
+COMPLIANT = ["--method", "cotap", "--num-envs", "2", "--threads", "1"]
+PROTOCOLS = {
+    "velocity-tracking": ["--num-envs", "2", "--threads", "1", "--episode-seconds", "5.0"],
+    "fidelity": ["--threads", "1", "--poses", "1", "--stiffness-levels", "200.0", "--settle-seconds", "2.0"],
+    "stability": ["--method", "facet", "--threads", "1", "--poses", "2", "--num-envs", "2", "--seconds", "0.2",
+                  "--settle-seconds", "0.2", "--change-seconds", "0.1"],
+    "static-stiffness": ["--method", "cotap", "--threads", "1", "--levels", "2", "--settle-seconds", "2.0"],
+    "punches": [*COMPLIANT, "--episode-seconds", "1.0"],
+    "fall-curve": [*COMPLIANT, "--levels", "2", "--onset", "0.5", "--window", "0.0", "0.2",
+                   "--episode-seconds", "0.8"],
+    "modulation": [*COMPLIANT, "--onset", "0.5", "--window", "0.0", "0.2", "--episode-seconds", "0.8"],
+}  # fmt: skip
+"""All but those that differ from one of these only in the force."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_evaluations_elsewhere_give_the_same(protocol, monkeypatch):
+    args = [protocol, *PROTOCOLS[protocol]]
+    here = evaluate(args)
+    with elsewhere(monkeypatch.setattr):
+        there = evaluate(args)
+    for result in (here, there):
+        result.pop("seconds")
+    assert json.dumps(here) == json.dumps(there)
