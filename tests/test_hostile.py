@@ -17,7 +17,7 @@ import torch
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from cotap import evaluate, train
+from cotap import compare, evaluate, train
 from cotap.agents.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
 from cotap.agents.runner import DualRunner
 from cotap.compliance.laws import LawConfig
@@ -283,3 +283,48 @@ def test_numbers_beyond_floats_in_a_config_are_refused():
     data["env"]["control_dt"] = math.inf
     with pytest.raises(ValueError, match="control_dt must be a finite number"):
         from_plain(BaseTraining, data).env.check()
+
+
+RESULT = {
+    "protocol": "impact", "method": "pd", "window": {"start": 1.0, "end": 2.0},
+    "settings": {"seed": 0, "env": {"a": [1]}},
+    "metrics": {"e_ee": {"mean": 0.1, "std": 0.1, "ci95": [0.09, 0.11]},
+                "fell": {"mean": None, "ci95": None, "reason": "-"}},
+    "metrics_without_falls": {"e_ee": {"mean": 0.1, "std": 0.1, "ci95": [0.09, 0.11]}},
+}  # fmt: skip
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers(-(10**400), 10**400) | st.floats() | st.text(max_size=8),
+    lambda v: st.lists(v, max_size=3) | st.dictionaries(st.text(max_size=4), v, max_size=3),
+    max_leaves=4,
+)
+
+
+@few
+@given(draw=st.data())
+def test_an_evaluation_with_changed_parts_is_compared_or_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], draw: st.DataObject
+):
+    a, b, out = (tmp_path / f"{name}.json" for name in "abo")
+    a.write_text(json.dumps(RESULT))
+    b.write_text(json.dumps(damage(RESULT, draw, json_values)))
+    options = draw.draw(st.sampled_from([[], ["--without-falls"]]))
+    status = compare.main([str(a), str(b), *options, "--json", str(out)])
+    told = capsys.readouterr().err
+    assert (status == 0 and not told) or (status == 2 and told.startswith("error: "))
+
+
+@few
+@given(data=st.binary(max_size=60) | st.integers(1, 200_000).map(lambda n: b"[" * n))
+def test_bytes_that_are_no_evaluation_are_refused(tmp_path: Path, data: bytes):
+    path = tmp_path / "a.json"
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match=r"is not (JSON|an evaluation)"):
+        compare.read(str(path))
+
+
+def test_settings_nested_too_deep_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    path = tmp_path / "a.json"
+    text = json.dumps(RESULT).replace('{"a": [1]}', '{"a":' * 900 + "1" + "}" * 900)
+    path.write_text(text)
+    assert compare.main([str(path), str(path)]) in (0, 2)
+    assert "Traceback" not in capsys.readouterr().err

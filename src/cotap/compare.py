@@ -36,7 +36,7 @@ def main(argv: list[str] | None = None) -> int:
         print(table(result))
         if options.json:
             write_json(Path(options.json), result)
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, RecursionError) as error:  # the last of settings nested without end
         print(f"error: {error}", file=sys.stderr)
         return 2
     return 0
@@ -46,11 +46,37 @@ def read(path: str) -> dict[str, Any]:
     """An evaluation's JSON. Raises ValueError for another file, OSError for none."""
     try:
         content = json.loads(Path(path).read_text(encoding="utf-8"))
-    except ValueError as error:  # not JSON, or not text
+    except (ValueError, RecursionError) as error:  # not JSON, not text, or nested without end
         raise ValueError(f"{path!r} is not JSON: {error}") from error
     if not isinstance(content, dict) or not {"protocol", "metrics", "settings"} <= content.keys():
         raise ValueError(f"{path!r} is not an evaluation: it lacks protocol, metrics or settings")
+    for part in ("metrics", "metrics_without_falls", "settings"):
+        if not isinstance(content.get(part, {}), dict):
+            raise ValueError(f"{path!r}: {part} must be an object, got {type(content[part]).__name__}")
+    for part in ("metrics", "metrics_without_falls"):
+        for name, summary in content.get(part, {}).items():
+            _require_summary(f"{path!r}: {part}.{name}", summary)
     return content
+
+
+def _require_summary(where: str, summary: Any) -> None:
+    """Raise ValueError unless this is a mean with its interval, or null in place of either."""
+    if not isinstance(summary, dict) or not {"mean", "ci95"} <= summary.keys():
+        raise ValueError(f"{where} must have mean and ci95")
+    mean, interval = summary["mean"], summary["ci95"]
+    if mean is not None and not _is_number(mean):
+        raise ValueError(f"{where}.mean must be a finite number or null, got {mean!r:.80}")
+    pair = isinstance(interval, list) and len(interval) == 2 and all(_is_number(x) for x in interval)
+    if interval is not None and not pair:
+        raise ValueError(f"{where}.ci95 must be two finite numbers or null, got {interval!r:.80}")
+
+
+def _is_number(value: Any) -> bool:
+    """Whether this is a number that a float holds; JSON has larger ones."""
+    try:
+        return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    except OverflowError:
+        return False
 
 
 def compare(a: dict[str, Any], b: dict[str, Any], without_falls: bool = False) -> dict[str, Any]:
