@@ -396,8 +396,11 @@ class H1Env(VecEnv):
         """Go on exactly where `state_dict` was taken; on another kind of device or with another backend, with its own
         arithmetic and random numbers. Raises ValueError for another number of worlds."""
         self.sim.restore(Snapshot(**state["sim"]))
+        # Where the clock could not jump before, it has not jumped.
+        untimed = {"step_timing"} - state["parts"].keys()
         for name, part in self._parts().items():
-            part.load_state_dict(state["parts"][name])
+            if name not in untimed:
+                part.load_state_dict(state["parts"][name])
         for name in ("delay_s", "previous", "current"):
             setattr(self.targets, name, restored(f"delay.{name}", state["delay"][name], getattr(self.targets, name)))
         self._kp, self._kd = self.randomizer.gains()
