@@ -29,6 +29,14 @@ EVALUATIONS = {
         "velocity-tracking.small": ["velocity-tracking", "--episode-seconds", "10", "--method", "cotap", *SMALL],
         "impact.stance": ["impact", "--num-envs", "1024", "--method", "cotap"],
         "impact.walking": ["impact", "--num-envs", "1024", "--method", "cotap", "--mode", "walking"],
+        "impact.walking.random": [
+            "impact", "--num-envs", "1024", "--method", "cotap", "--mode", "walking", "--random-direction",
+        ],
+    },
+    "facet": {
+        "velocity-tracking": [*VELOCITY, "--method", "facet"],
+        "velocity-tracking.small": ["velocity-tracking", "--episode-seconds", "10", "--method", "facet", *SMALL],
+        "impact.stance": ["impact", "--num-envs", "1024", "--method", "facet"],
     },
 }  # fmt: skip
 """What vouches for each policy; the small one is repeated by the tests."""
@@ -46,8 +54,9 @@ def ship(source: Path, name: str, before: list[Path]) -> int:
     content = load_checkpoint(source)
     target = checkpoint_path(name)
     target.parent.mkdir(exist_ok=True)
-    save_checkpoint(target, content | {"learner": {}, "env": {}})
-    config = content["config"]
+    # Where the machine keeps the repository is nobody's business.
+    config = content["config"] | {"command": content["config"]["command"].replace(f"{Path.cwd()}/", "")}
+    save_checkpoint(target, content | {"learner": {}, "env": {}, "config": config})
     write_json(
         target.with_suffix(".json"),
         {

@@ -13,8 +13,8 @@ from cotap.agents.actors import AgentLayout, DualActorCritic
 from cotap.agents.checkpoint import MALFORMED, CheckpointError, load_checkpoint, require_parts
 from cotap.checks import require_one_of, require_positive_int
 
-CHECKPOINTS = ("base", "cotap", "cotap-no-ratio", "cotap-torque-critic", "cotap-goals")
-"""Names under which checkpoints are shipped: both stages, and the second stage's ablations."""
+CHECKPOINTS = ("base", "cotap", "facet", "cotap-no-ratio", "cotap-torque-critic", "cotap-goals")
+"""Names under which checkpoints are shipped: both stages, the second under FACET's law, and its ablations."""
 
 
 def checkpoint_path(name: str) -> Path:

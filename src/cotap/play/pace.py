@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 
-LAG_S = 0.2
+LAG_S = 1.0
 """Further behind than this, what was lost is given up rather than caught up with [s]."""
 
 
