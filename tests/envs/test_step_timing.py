@@ -8,9 +8,13 @@ import math
 import pytest
 import torch
 
+from cotap.agents.actors import as_dict
+from cotap.configs import from_plain
 from cotap.envs import H1Env, H1EnvConfig, step_timing
 from cotap.envs.commands import HURRY, Catch, CommandConfig, CommandSource
 from cotap.envs.step_timing import BINS, GAIN, HURRY_S, REST_S, StepTiming, feature_reflection, features, risk_at
+from cotap.evaluation.disturbance import Impact
+from cotap.evaluation.policy import load_policy, shipped_checkpoint
 from cotap.robots import ROBOTS
 
 DT = 0.02
@@ -141,3 +145,42 @@ def test_weights_of_another_robot_are_refused(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(step_timing, "feature_reflection", lambda _: feature_reflection(spec).part(slice(0, 6)))
     with pytest.raises(ValueError, match="fitted for another robot than 'h1'"):
         StepTiming(spec, 1, DT)
+
+
+def test_shipped_weights_tell_a_robot_that_stands_from_one_that_falls(env: H1Env) -> None:
+    """Random weights would say the same of both."""
+    n, still = 2, torch.zeros(2, 3)
+    lean, rate = torch.tensor([0.0, 0.5]), torch.tensor([0.0, 2.5])
+    down = torch.stack((lean.sin(), torch.zeros(n), -lean.cos()), 1)  # leaning forward, and turning further that way
+    state = dataclasses.replace(
+        env.state,
+        joint_pos=torch.tensor([[j.default_rad for j in env.spec.joints]]).expand(n, -1),
+        joint_vel=torch.zeros(n, env.num_actions),
+        projected_gravity_t=down,
+        torso_angular_velocity_t=torch.stack((still[:, 0], rate, still[:, 2]), 1),
+    )
+    zero = torch.zeros(n)
+    command = dataclasses.replace(env.commands.current(), velocity_h=still[:, :2], yaw_rate=zero, stand=zero + 1)
+    risk = timing(n).risk(state, command)
+    assert risk[0, BINS] < 0.1
+    assert risk[1, BINS] > 0.5
+    assert risk[1, :BINS].min() > risk[0, BINS]
+
+
+@pytest.mark.slow
+def test_it_keeps_robots_on_their_feet() -> None:
+    """The same blows on walking robots under the shipped policy, with and without."""
+    policy = load_policy(shipped_checkpoint("cotap"))
+    falls = {}
+    for timed in (True, False):
+        protocol = Impact(num_envs=256, force=(500.0, 0.0, 0.0), random_direction=True, mode="walking")
+        cfg = protocol.configure(from_plain(H1EnvConfig, policy.config["training"]["env"]))
+        cfg.commands.step_timing, cfg.upper_body.sampling.enabled = timed, False
+        env = H1Env(cfg)
+        protocol.prepare(env)
+        env.reset()
+        fell = torch.zeros(256, dtype=torch.bool)
+        for _ in range(150):
+            fell |= env.step(policy(as_dict(env.get_observations())))[3]["falls"]
+        falls[timed] = int(fell.sum())
+    assert falls[True] < 0.7 * falls[False]

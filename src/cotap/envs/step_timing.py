@@ -81,9 +81,9 @@ class StepTiming(Stateful):
         self.model = FallRisk(feature_reflection(spec)).eval()
         stored = resources.files("cotap.envs").joinpath(_WEIGHTS).read_bytes()
         with np.load(io.BytesIO(stored), allow_pickle=False) as weights:
-            state = {k: torch.from_numpy(weights[k].astype(np.float32)) for k in weights.files}
+            state = {k: torch.tensor(weights[k].astype(np.float32)) for k in weights.files}
         try:
-            self.model.net.load_state_dict(state)
+            self.model.net.load_state_dict(state, assign=True)
         except RuntimeError as error:
             raise ValueError(f"step timing was fitted for another robot than {spec.name!r}: {error}") from error
 
