@@ -29,10 +29,12 @@ def resident_mib(pid: int) -> float:
     return int(kib) / 2**10
 
 
-def soak(folder: Path, seconds: float, options: list[str], interval: float) -> tuple[np.ndarray, np.ndarray]:
+def soak(
+    folder: Path, log_file: Path, stage: str, seconds: float, options: list[str], interval: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Train for `seconds`. Returns samples (S, 2) of time [s] and memory [MiB], and the throughput (I,) [steps/s]."""
-    command = [sys.executable, "-m", "cotap.train", "base", "--iterations", str(FOREVER), "--run-dir", str(folder)]
-    with (folder.parent / "log").open("w") as log:
+    command = [sys.executable, "-m", "cotap.train", stage, "--iterations", str(FOREVER), "--run-dir", str(folder)]
+    with log_file.open("w") as log:
         process = subprocess.Popen([*command, *options], stdout=log, stderr=subprocess.STDOUT)
         start, samples = time.monotonic(), []
         try:
@@ -43,7 +45,7 @@ def soak(folder: Path, seconds: float, options: list[str], interval: float) -> t
             process.send_signal(signal.SIGTERM)
             status = process.wait()
     if status:
-        raise SystemExit((folder.parent / "log").read_text())
+        raise SystemExit(log_file.read_text())
     events = EventAccumulator(str(folder), size_guidance={"scalars": 0})
     events.Reload()
     return np.array(samples), np.array([e.value for e in events.Scalars("throughput/steps_per_s")])
@@ -81,13 +83,18 @@ def main() -> int:
     """Returns the exit status: 0 if memory and throughput stay within their bounds, else 1."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=60.0)
+    parser.add_argument("--stage", choices=("base", "distill"), default="base")
+    parser.add_argument("--run-dir", type=Path, help="keep the run here; by default it is thrown away")
     parser.add_argument("--interval", type=float, default=5.0, help="seconds between samples of memory")
     parser.add_argument("--json", type=Path, help="write the figures here")
     parser.add_argument("--plot", type=Path, help="write the plot here (PNG)")
     parser.add_argument("options", nargs="*", help="options of the training, after --")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="cotap-soak-") as work:
-        samples, rate = soak(Path(work) / "run", 60.0 * options.minutes, options.options, options.interval)
+        samples, rate = soak(
+            options.run_dir or Path(work) / "run", Path(work) / "log", options.stage, 60.0 * options.minutes,
+            options.options, options.interval,
+        )  # fmt: skip
     result: dict[str, Any] = {
         "minutes": samples[-1, 0] / 60.0,
         "iterations": len(rate),

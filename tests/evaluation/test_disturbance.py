@@ -158,7 +158,7 @@ def test_a_blow_moves_the_hand_that_it_hits():
     blow = Impact(num_envs=2, force=(200.0, 0.0, 0.0), randomize=False, pelvis="fixed", episode_seconds=4.0)
     t, m = run(blow, method="cotap", stiffness=(800.0,))
     assert float(t.hand_error[:49, :, 0].max()) < 0.02
-    assert float(t.hand_error[50:, :, 0].max()) > 0.1
+    assert float(t.hand_error[50:, :, 0].max()) > 0.04
     assert float(t.hand_error[50:, :, 1].max()) < 0.05
     assert m["metrics"]["recovery_s"]["mean"] > 0.1
     assert m["metrics"]["e_ee_hit"]["mean"] > m["metrics"]["e_ee"]["mean"]
