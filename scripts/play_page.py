@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import contextlib
 import io
+import math
+import os
 import re
 import shutil
 import socket
@@ -64,6 +66,15 @@ def free_port() -> int:
         return probe.getsockname()[1]
 
 
+def processor_s(process: int) -> float:
+    """Processor time that a process has used [s]; NaN where the system has no /proc."""
+    try:
+        fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return math.nan
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
 def fill(page: Any, label: str, value: float, nth: int = 0) -> None:
     """Write a number into the box beside the slider called `label`."""
     box = page.get_by_text(label, exact=True).nth(nth).locator("xpath=ancestor::*[.//input][1]").locator("input").last
@@ -103,19 +114,20 @@ class Speed:
             try:
                 answers = self._open(pages[0], port, play, begin)
                 pages[0].get_by_text(STATUS).wait_for(timeout=1000.0 * PATIENCE_S)
-                usable = time.perf_counter() - begin
+                usable, busy = time.perf_counter() - begin, processor_s(play.pid)
                 for page in pages[1:]:
                     page.goto(f"http://127.0.0.1:{port}")
                     page.get_by_text(STATUS).wait_for(timeout=1000.0 * PATIENCE_S)
-                at_pace = self._rate(pages[0])
+                at_pace, at_pace_ms = self._rate(pages[0], play.pid)
                 fill(pages[0], "speed", 4.0)
-                at_most = self._rate(pages[0])
+                at_most, at_most_ms = self._rate(pages[0], play.pid)
             finally:
                 play.terminate()
                 play.wait(30.0)
         return (
-            f"page answers after {answers:.1f} s, can be used after {usable:.1f} s\n"
-            f"{self.viewers} viewers: {at_pace:.1f} control steps/s at speed 1, {at_most:.1f} at speed 4"
+            f"page answers after {answers:.1f} s, can be used after {usable:.1f} s ({busy:.1f} s of processor time)\n"
+            f"{self.viewers} viewers: {at_pace:.1f} control steps/s at speed 1 ({at_pace_ms:.1f} ms of processor time "
+            f"each), {at_most:.1f} at speed 4 ({at_most_ms:.1f} ms)"
         )
 
     def _open(self, page: Any, port: int, play: subprocess.Popen[bytes], begin: float) -> float:
@@ -130,11 +142,14 @@ class Speed:
             time.sleep(0.02)
         raise ValueError(f"cotap.play did not listen at port {port} within {PATIENCE_S:g} s")
 
-    def _rate(self, page: Any) -> float:
-        """Control steps per second of wall time, from the simulated time that the page shows."""
+    def _rate(self, page: Any, process: int) -> tuple[float, float]:
+        """Control steps per second of wall time, from the simulated time that the page shows, and the program's
+        processor time per step [ms]."""
         page.wait_for_timeout(2000)
-        (first, then), (last, now) = _shown_time(page), _shown_time_after(page, self.seconds)
-        return 50.0 * (last - first) / (now - then)
+        (first, then), idle = _shown_time(page), processor_s(process)
+        (last, now), busy = _shown_time_after(page, self.seconds), processor_s(process)
+        steps = 50.0 * (last - first)
+        return steps / (now - then), 1e3 * (busy - idle) / steps
 
 
 def _shown_time(page: Any) -> tuple[float, float]:
