@@ -12,7 +12,6 @@ import contextlib
 import io
 import math
 import os
-import re
 import shutil
 import socket
 import subprocess
@@ -25,6 +24,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tyro
 
 from cotap.checks import require_one_of, require_range
@@ -36,6 +36,18 @@ ARGUMENTS = [
 ]  # fmt: skip
 STATUS = "control steps/s"
 """What the head of the page says once everything runs."""
+SHOWN_TIMES = """seconds => new Promise(resolve => {
+    const seen = [], end = performance.now() + 1e3 * seconds;
+    let last = null;
+    const timer = setInterval(() => {
+        const head = [...document.querySelectorAll("p")].find(p => p.textContent.includes("control steps/s"));
+        const shown = head ? parseFloat(head.textContent) : NaN;
+        if (last !== null && shown > last) seen.push([1e-3 * performance.now(), shown]);
+        if (shown >= 0) last = shown;
+        if (performance.now() > end) { clearInterval(timer); resolve(seen); }
+    }, 20);
+})"""
+"""Wall time and simulated time [s] whenever the page's head changes."""
 PATIENCE_S = 180.0
 DRAWN_MS = 150.0
 """How long a step takes to be seen in the browser [ms]."""
@@ -143,26 +155,22 @@ class Speed:
         raise ValueError(f"cotap.play did not listen at port {port} within {PATIENCE_S:g} s")
 
     def _rate(self, page: Any, process: int) -> tuple[float, float]:
-        """Control steps per second of wall time, from the simulated time that the page shows, and the program's
-        processor time per step [ms]."""
+        """Control steps per second of wall time, and the program's processor time per step [ms]."""
         page.wait_for_timeout(2000)
-        (first, then), idle = _shown_time(page), processor_s(process)
-        (last, now), busy = _shown_time_after(page, self.seconds), processor_s(process)
-        steps = 50.0 * (last - first)
-        return steps / (now - then), 1e3 * (busy - idle) / steps
+        idle, begin = processor_s(process), time.perf_counter()
+        shown = page.evaluate(SHOWN_TIMES, self.seconds)
+        busy, seconds = processor_s(process) - idle, time.perf_counter() - begin
+        rate = 50.0 * slope(shown)
+        return rate, 1e3 * busy / (rate * seconds)
 
 
-def _shown_time(page: Any) -> tuple[float, float]:
-    """Simulated seconds just as the page changes them, and the wall's."""
-    before = _status(page)
-    while (shown := _status(page)) == before:
-        page.wait_for_timeout(10)
-    return shown, time.perf_counter()
+def slope(points: list[list[float]]) -> float:
+    """Slope of the straight line nearest to points (x, y): single times are late by what a browser takes to draw.
 
-
-def _shown_time_after(page: Any, seconds: float) -> tuple[float, float]:
-    page.wait_for_timeout(1000.0 * seconds)
-    return _shown_time(page)
+    Raises ValueError for less than three points."""
+    if len(points) < 3:
+        raise ValueError(f"the page's head changed {len(points)} times only")
+    return float(np.polyfit(*np.array(points).T, 1)[0])
 
 
 def _until(page: Any, happened: Callable[[], bool]) -> None:
@@ -172,14 +180,6 @@ def _until(page: Any, happened: Callable[[], bool]) -> None:
         if time.monotonic() > deadline:
             raise ValueError("the simulation does not take what the page sends")
         page.wait_for_timeout(20)
-
-
-def _status(page: Any) -> float:
-    text = page.get_by_text(STATUS).inner_text()
-    found = re.search(r"([\d.]+) s", text)
-    if found is None:
-        raise ValueError(f"the page's head shows no time: {text!r}")
-    return float(found.group(1))
 
 
 @dataclass
