@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import contextlib
 import io
-import re
+import math
+import os
 import shutil
 import socket
 import subprocess
@@ -23,6 +24,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tyro
 
 from cotap.checks import require_one_of, require_range
@@ -34,6 +36,18 @@ ARGUMENTS = [
 ]  # fmt: skip
 STATUS = "control steps/s"
 """What the head of the page says once everything runs."""
+SHOWN_TIMES = """seconds => new Promise(resolve => {
+    const seen = [], end = performance.now() + 1e3 * seconds;
+    let last = null;
+    const timer = setInterval(() => {
+        const head = [...document.querySelectorAll("p")].find(p => p.textContent.includes("control steps/s"));
+        const shown = head ? parseFloat(head.textContent) : NaN;
+        if (last !== null && shown > last) seen.push([1e-3 * performance.now(), shown]);
+        if (shown >= 0) last = shown;
+        if (performance.now() > end) { clearInterval(timer); resolve(seen); }
+    }, 20);
+})"""
+"""Wall time and simulated time [s] whenever the page's head changes."""
 PATIENCE_S = 180.0
 DRAWN_MS = 150.0
 """How long a step takes to be seen in the browser [ms]."""
@@ -62,6 +76,15 @@ def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]
+
+
+def processor_s(process: int) -> float:
+    """Processor time that a process has used [s]; NaN where the system has no /proc."""
+    try:
+        fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return math.nan
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def fill(page: Any, label: str, value: float, nth: int = 0) -> None:
@@ -103,19 +126,20 @@ class Speed:
             try:
                 answers = self._open(pages[0], port, play, begin)
                 pages[0].get_by_text(STATUS).wait_for(timeout=1000.0 * PATIENCE_S)
-                usable = time.perf_counter() - begin
+                usable, busy = time.perf_counter() - begin, processor_s(play.pid)
                 for page in pages[1:]:
                     page.goto(f"http://127.0.0.1:{port}")
                     page.get_by_text(STATUS).wait_for(timeout=1000.0 * PATIENCE_S)
-                at_pace = self._rate(pages[0])
+                at_pace, at_pace_ms = self._rate(pages[0], play.pid)
                 fill(pages[0], "speed", 4.0)
-                at_most = self._rate(pages[0])
+                at_most, at_most_ms = self._rate(pages[0], play.pid)
             finally:
                 play.terminate()
                 play.wait(30.0)
         return (
-            f"page answers after {answers:.1f} s, can be used after {usable:.1f} s\n"
-            f"{self.viewers} viewers: {at_pace:.1f} control steps/s at speed 1, {at_most:.1f} at speed 4"
+            f"page answers after {answers:.1f} s, can be used after {usable:.1f} s ({busy:.1f} s of processor time)\n"
+            f"{self.viewers} viewers: {at_pace:.1f} control steps/s at speed 1 ({at_pace_ms:.1f} ms of processor time "
+            f"each), {at_most:.1f} at speed 4 ({at_most_ms:.1f} ms)"
         )
 
     def _open(self, page: Any, port: int, play: subprocess.Popen[bytes], begin: float) -> float:
@@ -130,24 +154,23 @@ class Speed:
             time.sleep(0.02)
         raise ValueError(f"cotap.play did not listen at port {port} within {PATIENCE_S:g} s")
 
-    def _rate(self, page: Any) -> float:
-        """Control steps per second of wall time, from the simulated time that the page shows."""
+    def _rate(self, page: Any, process: int) -> tuple[float, float]:
+        """Control steps per second of wall time, and the program's processor time per step [ms]."""
         page.wait_for_timeout(2000)
-        (first, then), (last, now) = _shown_time(page), _shown_time_after(page, self.seconds)
-        return 50.0 * (last - first) / (now - then)
+        idle, begin = processor_s(process), time.perf_counter()
+        shown = page.evaluate(SHOWN_TIMES, self.seconds)
+        busy, seconds = processor_s(process) - idle, time.perf_counter() - begin
+        rate = 50.0 * slope(shown)
+        return rate, 1e3 * busy / (rate * seconds)
 
 
-def _shown_time(page: Any) -> tuple[float, float]:
-    """Simulated seconds just as the page changes them, and the wall's."""
-    before = _status(page)
-    while (shown := _status(page)) == before:
-        page.wait_for_timeout(10)
-    return shown, time.perf_counter()
+def slope(points: list[list[float]]) -> float:
+    """Slope of the straight line nearest to points (x, y): single times are late by what a browser takes to draw.
 
-
-def _shown_time_after(page: Any, seconds: float) -> tuple[float, float]:
-    page.wait_for_timeout(1000.0 * seconds)
-    return _shown_time(page)
+    Raises ValueError for less than three points."""
+    if len(points) < 3:
+        raise ValueError(f"the page's head changed {len(points)} times only")
+    return float(np.polyfit(*np.array(points).T, 1)[0])
 
 
 def _until(page: Any, happened: Callable[[], bool]) -> None:
@@ -157,14 +180,6 @@ def _until(page: Any, happened: Callable[[], bool]) -> None:
         if time.monotonic() > deadline:
             raise ValueError("the simulation does not take what the page sends")
         page.wait_for_timeout(20)
-
-
-def _status(page: Any) -> float:
-    text = page.get_by_text(STATUS).inner_text()
-    found = re.search(r"([\d.]+) s", text)
-    if found is None:
-        raise ValueError(f"the page's head shows no time: {text!r}")
-    return float(found.group(1))
 
 
 @dataclass

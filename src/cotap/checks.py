@@ -5,8 +5,10 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Collection
+from typing import TYPE_CHECKING
 
-import torch
+if TYPE_CHECKING:
+    import torch
 
 
 def require_positive_int(name: str, value: int) -> int:
@@ -59,8 +61,8 @@ def require_shape(name: str, value: torch.Tensor, shape: tuple[int, ...]) -> tor
 
 def require_all_finite(name: str, value: torch.Tensor) -> torch.Tensor:
     """Return `value` if all its elements are finite, else raise ValueError with the first index."""
-    bad = ~torch.isfinite(value)
-    if bad.any():
-        index = tuple(int(i) for i in bad.nonzero()[0])
+    finite = value.isfinite()
+    if not finite.all():
+        index = tuple(int(i) for i in (~finite).nonzero()[0])
         raise ValueError(f"{name} must be finite, got {value[index].item()} at index {index}")
     return value

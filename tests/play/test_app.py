@@ -86,6 +86,17 @@ def test_a_checkpoint_that_is_refused_is_shown_as_it_was(app):
     assert app.panel._handles["a.checkpoint"].value == "base"
 
 
+def test_no_browser_is_asked_for_an_environment_map_and_for_shadows_only_when_they_are_wanted(app):
+    def last(kind):
+        messages = app.server._websock_server._broadcast_buffer.message_from_id.values()
+        return [m for m in messages if type(m).__name__ == kind][-1]
+
+    assert last("EnvironmentMapMessage").hdri_data is None
+    assert not last("EnableLightsMessage").cast_shadow
+    app.scene.cast_shadows(True)
+    assert last("EnableLightsMessage").cast_shadow
+
+
 def test_a_simulation_that_fails_ends_the_program_and_says_why(app, monkeypatch):
     monkeypatch.setattr(app.session, "step", lambda: 1 / 0)
     with pytest.raises(ZeroDivisionError):

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
+import os
 import shutil
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -23,6 +26,22 @@ def test_bad_input_is_named(arguments, message, capsys, monkeypatch):
     monkeypatch.setattr(shutil, "which", lambda _: None)
     assert play_page.main(arguments) == 2
     assert message in capsys.readouterr().err
+
+
+def test_the_rate_is_the_slope_whatever_single_times_are_late_by():
+    late = [0.0, 0.1, 0.1, 0.0, 0.0, 0.1, 0.1, 0.0]
+    assert play_page.slope([[0.5 * i + d, 0.4 * i] for i, d in enumerate(late)]) == pytest.approx(0.8, rel=0.01)
+    with pytest.raises(ValueError, match="changed 2 times"):
+        play_page.slope([[0.0, 0.0], [1.0, 1.0]])
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="no /proc")
+def test_processor_time_is_the_process_own():
+    assert play_page.processor_s(os.getpid()) == pytest.approx(time.process_time(), abs=0.1)
+
+
+def test_processor_time_of_no_process_is_no_number():
+    assert math.isnan(play_page.processor_s(2**30))
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from cotap.envs.rewards import LowerRewards, RewardGroup, UpperRewards
 from cotap.evaluation.policy import shipped_checkpoint
 from cotap.play.forces import Push
 from cotap.play.sample import effective_stiffness
@@ -120,6 +121,16 @@ def test_along_a_straight_arm_the_effective_stiffness_is_finite():
     stiffness = effective_stiffness(jacobian, 100.0 * torch.eye(4))
     assert torch.isfinite(stiffness).all()
     assert float(stiffness[2, 2]) == pytest.approx(1e6, rel=1e-3)
+
+
+def test_robots_move_alike_whether_or_not_rewards_are_reckoned():
+    one, other = (Session({"base": shipped_checkpoint("base")}) for _ in range(2))
+    assert [list(group.terms) for group in one.env._groups] == [["alive"], ["alive"]]
+    other.env._groups = (
+        RewardGroup("lower", LowerRewards(), other.dt), RewardGroup("upper", UpperRewards(), other.dt)
+    )  # fmt: skip
+    for a, b in zip(run(one, 20), run(other, 20), strict=True):
+        np.testing.assert_array_equal(a["qpos"], b["qpos"])
 
 
 def test_stiffness_stays_what_was_set_under_a_policy_that_was_trained_with_all():

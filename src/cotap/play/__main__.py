@@ -71,6 +71,10 @@ def _run(options: PlayOptions) -> int:
 def _live(options: PlayOptions, server: ViserServer) -> App:
     import torch
 
+    from cotap.play.lean import import_tensordict
+
+    import_tensordict()  # before what would import it whole
+
     from cotap.evaluation.policy import shipped_checkpoint, shipped_names
     from cotap.play.app import App
     from cotap.play.session import Session
@@ -83,6 +87,10 @@ def _live(options: PlayOptions, server: ViserServer) -> App:
 
 
 def _replay(options: PlayOptions, server: ViserServer) -> Replay:
+    from cotap.play.lean import import_tensordict
+
+    import_tensordict()
+
     from cotap.evaluation.recording import load_recording
     from cotap.play.replay import Replay
 

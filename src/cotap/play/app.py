@@ -124,11 +124,13 @@ class App:
         drawn = None
         while not self._stop.wait(1.0 / DRAW_HZ):
             now = time.monotonic()
+            latest = self._latest
+            if latest is None:
+                continue
             if now >= due["status"]:
                 due["status"] = now + 1.0 / STATUS_HZ
                 self._show_status()
-            latest = self._latest
-            if latest is None or self.archive.filming.is_set():
+            if self.archive.filming.is_set():
                 continue
             self.scene.shown = self._shown()
             self.scene.show(latest[1])
@@ -174,6 +176,12 @@ class App:
                 setattr(scene, name, bool(event.target.value))
 
             box.on_update(update)
+        shadows = gui.add_checkbox("shadows", False, hint="slow in a browser without a graphics card")
+
+        async def cast(event: viser.GuiEvent[Any]) -> None:
+            scene.cast_shadows(bool(event.target.value))
+
+        shadows.on_update(cast)
         gui.add_markdown(
             "Green: where the reference has the hand. Orange ball: the hand; drag it. Red arrow: force on it. "
             "Blue wires: the stiffness asked for; orange: the effective one (30 cm for 1000 N/m). "

@@ -27,6 +27,7 @@ HAND_M, REFERENCE_M = 0.055, 0.04
 HIDDEN = 1e-6
 """Scale of what is not there: sizes of batches stay as they are."""
 HAND, REFERENCE, FORCE, CONTACT = (230, 120, 40), (40, 170, 80), (200, 30, 50), (230, 153, 51)
+GROUND_LIGHT = (120, 120, 130)
 COMMANDED, EFFECTIVE = (40, 110, 220), (240, 150, 60)
 
 
@@ -45,9 +46,10 @@ class Scene:
         self._server, self._count, self._hands = server, count, len(spec.arms)
         model, self.shapes = visual_model(spec)
         self._pose = RobotPose(spec, model)
-        self._robots = ViserMujocoScene(server, model, count)
-        self._robots.camera_tracking_enabled = False
-        self._add_surroundings()
+        with server.atomic():  # no browser sees what mjviser asks for before it is changed
+            self._robots = ViserMujocoScene(server, model, count)
+            self._robots.camera_tracking_enabled = False
+            self._add_surroundings()
         ball = trimesh.creation.icosphere(subdivisions=2)
         self.hands = self._batch("hands", ball, HAND, HAND_M)
         """Balls at the hands, robot by robot, to be taken hold of."""
@@ -81,13 +83,18 @@ class Scene:
             self._show_contacts([p[2] for p in poses])
         self._server.flush()
 
+    def cast_shadows(self, on: bool) -> None:
+        """Whether things cast shadows; without a graphics card, a browser draws few pictures per second then."""
+        self._server.scene.configure_default_lights(cast_shadow=on)
+
     def to_robot(self, point: tuple[float, float, float], robot: int) -> tuple[float, ...]:
         """A point of the page in the world of a robot."""
         return tuple(float(v) for v in np.asarray(point) - self._offset[robot])
 
     def _add_surroundings(self) -> None:
         scene = self._server.scene
-        scene.configure_environment_map(environment_intensity=0.25)
+        scene.configure_environment_map(hdri=None)  # mjviser asks for one
+        scene.add_light_hemisphere("/sky", ground_color=GROUND_LIGHT, intensity=0.8)
         self._floor = scene.add_frame("/floor", show_axes=False)
         scene.add_grid(
             "/floor/grid", infinite_grid=True, cell_size=0.5, section_size=1.0, fade_distance=25.0, plane_opacity=0.5,

@@ -29,6 +29,10 @@ def open_server(host: str, port: int) -> viser.ViserServer:
         raise PortTaken(_advice(host, port, "another program has just taken it"))
     # People's simulations stay theirs: no public tunnel at the push of a button.
     server.gui.configure_theme(show_share_button=False, show_logo=False, control_width="large")
+    # A browser that draws without a graphics card takes seconds to prepare an environment map, and as long for every
+    # few frames with it or with shadows.
+    server.scene.configure_environment_map(hdri=None)
+    server.scene.configure_default_lights(cast_shadow=False)
     return server
 
 

@@ -1,0 +1,26 @@
+"""A quick start: what is loaded before the page answers, and before the robot walks."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+LOADED = """
+import sys
+import cotap.play.__main__, cotap.play.server
+assert "torch" not in sys.modules, "the page answers before torch is loaded"
+import torch.compiler
+told = torch.compiler.allow_in_graph, torch.compiler.assume_constant_result
+from cotap.play.lean import import_tensordict
+import_tensordict()
+assert told == (torch.compiler.allow_in_graph, torch.compiler.assume_constant_result)
+import cotap.play.app, cotap.play.session
+assert "torch._dynamo" not in sys.modules, "torch's compiler was loaded"
+from tensordict import TensorDict
+both = torch.stack([TensorDict({"a": torch.ones(3)}, batch_size=[3])] * 2)
+assert both.lock_().unlock_()["a"].shape == (2, 3)
+"""
+
+
+def test_the_page_answers_without_torch_and_the_simulation_runs_without_its_compiler():
+    subprocess.run([sys.executable, "-c", LOADED], check=True)
