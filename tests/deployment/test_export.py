@@ -96,7 +96,7 @@ def test_a_distilled_policy_says_in_which_ranges_its_law_was_trained(spec, model
     training = DISTILL_RECIPES["default"](BASE_RECIPES["default"]())
     trained = load_policy(shipped_checkpoint("base"))
     history = ObservationHistory(actor_terms(19, 8), 1, 5)
-    targets = JointTargets(training.env.actions, spec, model, 0.8)
+    targets = JointTargets(training.env.actions, spec, model, training.env.commands)
     law = graph_module.describe(training.env, spec, targets, history, trained.model, "distill", "0" * 64).law
     assert law["left"]["name"] == "cotap"
     assert law["ranges"] == {"stiffness": [80.0, 1200.0], "null_stiffness": [24.0, 56.0], "alpha": [0.0, 1.0]}

@@ -69,6 +69,21 @@ def test_soles_move_under_the_body_as_the_ground_would(spec, model, velocity, ya
     assert rotation[0, 2] == pytest.approx(0.0, abs=5e-3)  # level fore and aft
 
 
+def test_feet_are_put_apart_by_what_is_asked(spec, model):
+    motion = StepMotion(spec, model, PERIOD, lift=0.0, stride=0.0, apart_m=0.06)
+    offsets = motion(torch.tensor([0.3]), torch.zeros(1, 2), torch.zeros(1))[0]
+    default = np.array([j.default_rad for j in spec.joints])
+    joints = default.copy()
+    for foot in range(2):
+        joints[motion.joints[foot].numpy()] += offsets[foot].numpy()
+    for foot, outward in ((0, 1.0), (1, -1.0)):
+        (was, _), (now, rotation) = sole(spec, model, default, foot), sole(spec, model, joints, foot)
+        assert now[1] - was[1] == pytest.approx(0.03 * outward, abs=1e-3)
+        # By rolling the leg: its height is left to change as it will.
+        np.testing.assert_allclose(now[[0, 2]], was[[0, 2]], atol=9e-3)
+        assert rotation[2, 1] == pytest.approx(outward * 0.03 / 0.83, abs=4e-3)
+
+
 def test_factors_scale_lift_and_stride_apart(spec, model):
     phase, velocity, turn = torch.tensor([0.79]), torch.tensor([[0.5, 0.0]]), torch.zeros(1)
     none = StepMotion(spec, model, PERIOD, lift=0.0, stride=0.0)(phase, velocity, turn)

@@ -49,6 +49,8 @@ class CommandConfig:
     Evaluation uses `STEADY_RAD`. Training does without (10): a robot that always steps never learns to stand."""
     gait_period_s: float = 0.8
     """Duration of a stride [s]."""
+    step_apart_m: float = 0.0
+    """How much further apart than in the default pose feet are put while stepping [m]."""
     step_timing: bool = False
     """Whether the gait clock jumps to where a robot that was struck catches itself (`StepTiming`)."""
 
@@ -64,6 +66,7 @@ class CommandConfig:
         require_range("commands.yaw_acceleration", self.yaw_acceleration, 1e-2, 1e3)
         require_range("commands.steady_rad", self.steady_rad, 0.0, 10.0)
         require_range("commands.gait_period_s", self.gait_period_s, 0.1, 10.0)
+        require_range("commands.step_apart_m", self.step_apart_m, 0.0, 0.5)
 
 
 @dataclass(frozen=True)
