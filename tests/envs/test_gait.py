@@ -84,6 +84,42 @@ def test_feet_are_put_apart_by_what_is_asked(spec, model):
         assert rotation[2, 1] == pytest.approx(outward * 0.03 / 0.83, abs=4e-3)
 
 
+def distance(spec, model, joints):
+    """Between soles, sideways [m]."""
+    return sole(spec, model, joints, 0)[0][1] - sole(spec, model, joints, 1)[0][1]
+
+
+@pytest.mark.parametrize(("phase", "swinging"), [(0.79, 0), (0.29, 1)])
+def test_the_swinging_foot_gives_way_by_what_is_missing(spec, model, phase, swinging):
+    motion = StepMotion(spec, model, PERIOD, clear_m=0.15)
+    roll = spec.indices(["left_hip_roll", "right_hip_roll"])
+    joints = np.array([j.default_rad for j in spec.joints])
+    rest, wide = torch.zeros(1, 19), torch.tensor(joints, dtype=torch.float32).unsqueeze(0)
+    assert not motion.giving_way(torch.tensor([phase]), wide, rest).any()
+    joints[roll] += -0.18, 0.18
+    near = distance(spec, model, joints)
+    assert 0.05 < near < 0.13
+    position = torch.tensor(joints, dtype=torch.float32).unsqueeze(0)
+    offsets = motion.giving_way(torch.tensor([phase]), position, rest)[0]
+    assert not offsets[1 - swinging].any()
+    joints[motion.joints[swinging].numpy()] += offsets[swinging].numpy()
+    assert distance(spec, model, joints) == pytest.approx(0.15, abs=5e-3)
+    # A foot that comes nearer is seen where it will be 0.1 s from now.
+    coming = rest.clone()
+    coming[:, roll] = torch.tensor([-1.0, 1.0])
+    ahead = motion.giving_way(torch.tensor([phase]), position, coming)[0, swinging] - offsets[swinging]
+    speed = (distance(spec, model, (position + 1e-3 * coming)[0].double().numpy()) - near) / 1e-3
+    expected = offsets[swinging] * (-0.1 * speed / (0.15 - near))
+    torch.testing.assert_close(ahead, expected.float(), rtol=0.02, atol=1e-5)
+
+
+def test_feet_never_give_way_unless_asked_to(spec, model):
+    motion = StepMotion(spec, model, PERIOD)
+    crossed = torch.tensor([[j.default_rad for j in spec.joints]])
+    crossed[:, spec.indices(["left_hip_roll", "right_hip_roll"])] = torch.tensor([-0.3, 0.3])
+    assert not motion.giving_way(torch.tensor([0.79]), crossed, torch.zeros(1, 19)).any()
+
+
 def test_factors_scale_lift_and_stride_apart(spec, model):
     phase, velocity, turn = torch.tensor([0.79]), torch.tensor([[0.5, 0.0]]), torch.zeros(1)
     none = StepMotion(spec, model, PERIOD, lift=0.0, stride=0.0)(phase, velocity, turn)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 from cotap.agents.distillation import DistillationConfig
 from cotap.configs.base import BaseTraining, reward_as_facet
+from cotap.envs.commands import STEP_APART_M, STEP_CLEAR_M
 
 
 @dataclass
@@ -30,6 +31,7 @@ def default(base: BaseTraining) -> DistillTraining:
     env = training.env
     env.assist.enabled = False
     env.commands.step_timing = True
+    env.commands.step_apart_m, env.commands.step_clear_m = STEP_APART_M, STEP_CLEAR_M
     env.upper_body.left.name = env.upper_body.right.name = "cotap"
     env.upper_body.sampling.enabled = True
     env.upper_body.sampling.full_alpha = 0.25

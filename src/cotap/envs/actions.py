@@ -66,8 +66,9 @@ class JointTargets:
         """(J,) [rad]."""
         self.num_lower = len(spec.lower_joints)
         self.steps = StepMotion(
-            spec, model, commands.gait_period_s, cfg.step_lift, cfg.step_stride, commands.step_apart_m
-        )
+            spec, model, commands.gait_period_s, cfg.step_lift, cfg.step_stride, commands.step_apart_m,
+            commands.step_clear_m,
+        )  # fmt: skip
         self.stance = StanceBalance(spec, model)
         twists = [j.axis == (0.0, 0.0, 1.0) for j in spec.joints]
         self.scale = torch.tensor([cfg.twist_scale if twist else cfg.lower_scale for twist in twists])
@@ -91,6 +92,7 @@ class JointTargets:
         """
         target = self.default + self.scale * action
         step = self.steps(command.phase, command.velocity_h, command.yaw_rate)
+        step = step + self.steps.giving_way(command.phase, joint_pos, joint_vel)
         target[:, self.steps.joints] += (1.0 - command.stand)[:, None, None] * step
         legs = self.stance.joints
         stance = self.stance(command.height, joint_pos, joint_vel, projected_gravity, angular_velocity)
