@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from cotap.envs.gait import StepMotion, desired_contact, sweep, swing_progress
+from cotap.envs.symmetry import joint_reflection
 
 PERIOD, STANCE = 0.8, 0.58
 
@@ -111,6 +112,25 @@ def test_the_swinging_foot_gives_way_by_what_is_missing(spec, model, phase, swin
     speed = (distance(spec, model, (position + 1e-3 * coming)[0].double().numpy()) - near) / 1e-3
     expected = offsets[swinging] * (-0.1 * speed / (0.15 - near))
     torch.testing.assert_close(ahead, expected.float(), rtol=0.02, atol=1e-5)
+
+
+def test_giving_way_is_the_same_in_the_mirror(spec, model):
+    motion = StepMotion(spec, model, PERIOD, clear_m=0.4)
+    rng = torch.Generator().manual_seed(0)
+    default = torch.tensor([j.default_rad for j in spec.joints])
+    position, velocity = default + 0.2 * torch.randn(64, 19, generator=rng), torch.randn(64, 19, generator=rng)
+    phase = torch.rand(64, generator=rng)
+    mirror = joint_reflection(spec, spec.joint_names)
+
+    def moved(phase, position, velocity):
+        offsets = torch.zeros(64, 19)
+        offsets[:, motion.joints] = motion.giving_way(phase, position, velocity)
+        return offsets
+
+    here = moved(phase, position, velocity)
+    assert here.any(1).sum() > 8
+    there = moved((phase + 0.5).remainder(1.0), mirror(position), mirror(velocity))
+    torch.testing.assert_close(there, mirror(here), atol=1e-4, rtol=1e-3)
 
 
 def test_feet_never_give_way_unless_asked_to(spec, model):
