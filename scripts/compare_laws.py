@@ -43,8 +43,8 @@ ROWS: dict[str, dict[str, Any]] = {
     "soft-pd": {"method": "soft-pd"},
     "cotap, joint error": {"method": "cotap"},
     "cotap, task error": {"method": "cotap", "error": "task"},
-    "cotap, joint error, critical damping": {"method": "cotap", "damping": "critical"},
-    "cotap, task error, critical damping": {"method": "cotap", "error": "task", "damping": "critical"},
+    "cotap, joint error, PD's damping": {"method": "cotap", "damping": "pd"},
+    "cotap, task error, PD's damping": {"method": "cotap", "error": "task", "damping": "pd"},
     "facet": {"method": "facet"},
     "cotap+facet, joint error": {"method": "cotap+facet"},
     "cotap+facet, task error": {"method": "cotap+facet", "error": "task"},
@@ -58,7 +58,7 @@ ROWS: dict[str, dict[str, Any]] = {
 AT_REST = tuple(name for name in ROWS if "damping" not in name)
 """Rows that differ at rest."""
 STRUCK = (
-    "pd", "facet", "cotap, joint error", "cotap, joint error, critical damping", "cotap, task error, critical damping",
+    "pd", "facet", "cotap, joint error, PD's damping", "cotap, joint error", "cotap, task error",
     "cotap+facet, joint error", "cotap+facet-matched, joint error",
 )  # fmt: skip
 """Rows that are struck."""

@@ -128,13 +128,9 @@ def against_pd(runs: Runs, envs: int) -> list[str]:
     ]  # fmt: skip
     rows = {"PD": ["--method", "pd"]} | {
         f"K {k}, alpha {a:g}": ["--method", "cotap", "--stiffness", str(k), "--alpha", str(a)]
-        for k, a in ((100, 1.0), (300, 1.0), (100, 0.7), (200, 0.5), (100, 0.3))
+        for k, a in ((100, 1.0), (300, 1.0), (100, 0.7), (200, 0.5), (300, 0.5), (500, 0.7))
     }
-    rows |= {
-        f"K {k}, alpha {a:g}, critical damping":
-        ["--method", "cotap", "--stiffness", str(k), "--alpha", str(a), "--damping", "critical"]
-        for k, a in ((300, 1.0), (300, 0.5), (500, 0.7))
-    }  # fmt: skip
+    rows["K 300, alpha 0.5, PD's damping"] = [*rows["K 300, alpha 0.5"], "--damping", "pd"]
     wins = []
     for mode, where in {"stance": [], "walking": ["--mode", "walking", "--random-direction"]}.items():
         pd = None

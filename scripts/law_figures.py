@@ -53,7 +53,7 @@ def draw_transient(result: dict[str, Any], until_s: float = 1.5) -> Any:
                 axis.plot(c["time"], mean, color="#2171b5", lw=1.2)
             axis.axhline(0.0, color="0.8", lw=0.6)
             axis.set(xlim=(-0.2, until_s))
-            axis.set_title(f"{name}\n{force} N".replace(", critical", ",\ncritical"), fontsize=8)
+            axis.set_title(f"{name}\n{force} N".replace(", PD", ",\nPD"), fontsize=8)
             axis.grid(alpha=0.2)
         line[0].set_ylabel("displacement along x [m]", fontsize=8)
     for axis in axes[-1]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from cotap.compliance.dynamics import gravity_torque
+from cotap.compliance.dynamics import gravity_torque, joint_inertia
 from cotap.compliance.interface import Arms, ArmState, LawParameters
 from cotap.compliance.laws import LAWS, CoTaPLaw, LawConfig, PDLaw
 from cotap.compliance.stiffness import resolve_joint_stiffness
@@ -44,7 +44,7 @@ def test_pd_is_pd(arms, rng):
 
 def test_alpha_zero_is_pd_with_gravity(arms, rng):
     state = a_state(arms, rng)
-    torque, _ = CoTaPLaw(arms, LawConfig())(state, parameters(alpha=0.0))
+    torque, _ = CoTaPLaw(arms, LawConfig(damping="pd"))(state, parameters(alpha=0.0))
     pd, _ = PDLaw(arms)(state, parameters())
     gravity = gravity_torque(arms.inertias, state.pose, state.to_heading[:, 2])
     q, dq = state.position + 0.05, state.velocity
@@ -97,13 +97,29 @@ def test_a_torso_softer_than_the_hand_is_bounded_and_counted(arms, rng):
     assert float(torch.linalg.eigvalsh(torque.stiffness).min()) > 0.0
 
 
-def test_critical_damping_is_an_option(arms, rng):
+def test_damping_is_critical_or_the_pd_laws(arms, rng):
     state = a_state(arms, rng)
-    pd, _ = CoTaPLaw(arms, LawConfig())(state, parameters())
+    pd, _ = CoTaPLaw(arms, LawConfig(damping="pd"))(state, parameters())
     torch.testing.assert_close(pd.damping, 2.0 * torch.eye(4).expand(6, 2, 4, 4))
-    critical, _ = CoTaPLaw(arms, LawConfig(damping="critical"))(state, parameters())
-    assert float((critical.damping - pd.damping).abs().max()) > 0.1
-    assert float(torch.linalg.eigvalsh(critical.damping).min()) > 0.0
+    critical, _ = CoTaPLaw(arms, LawConfig())(state, parameters())
+    # Critical: M s^2 + D s + K has every root twice, so that M^-1 D / 2 squared is M^-1 K.
+    inertia = joint_inertia(arms.inertias, state.pose).double()
+    half = 0.5 * torch.linalg.solve(inertia, critical.damping.double())
+    torch.testing.assert_close(half @ half, torch.linalg.solve(inertia, critical.stiffness.double()), rtol=1e-3, atol=1)
+
+
+def test_critical_damping_does_not_hold_back_a_moving_reference(arms, rng):
+    state = a_state(arms, rng)
+    moving = replace(state, target_velocity=torch.randn(6, 2, 4, generator=rng))
+    resting, _ = CoTaPLaw(arms, LawConfig())(state, parameters())
+    law, _ = CoTaPLaw(arms, LawConfig())(moving, parameters())
+    q, dq = state.position + 0.05, state.velocity
+    torch.testing.assert_close(law.at(q, dq), resting.at(q, dq - moving.target_velocity), rtol=1e-4, atol=1e-3)
+    torch.testing.assert_close(
+        law.at(q, moving.target_velocity), resting.at(q, torch.zeros_like(q)), rtol=1e-4, atol=1e-3
+    )
+    paper = [CoTaPLaw(arms, LawConfig(damping="pd"))(x, parameters())[0] for x in (state, moving)]
+    torch.testing.assert_close(paper[0].at(q, dq), paper[1].at(q, dq))
 
 
 def test_gains_that_differ_are_refused(arms):

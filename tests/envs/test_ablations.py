@@ -62,7 +62,7 @@ def test_without_the_ratio_stiffness_is_what_alpha_alone_makes_of_it(make_env):
     for e in (env, with_ratio):
         e.sim.qpos[:, 7 + 14] = e.sim.qpos[:, 7 + 18] = 1.45
         e.state = e.reader.read()
-        e.upper_body.send(e.state, e.targets.current[:, 11:])
+        e.upper_body.send(e.state, e.targets.current[:, 11:], e.motions.current().velocity)
     s = env.state
     jacobian = (s.heading_w.transpose(1, 2) @ s.torso_rotation_w).unsqueeze(1) @ env.reader.arm_chains.jacobian(s.arms)
     jacobian = jacobian.double()
@@ -84,7 +84,7 @@ def test_the_threshold_of_the_ratio_is_the_laws_own(make_env):
         env = make_env(1, upper_body=cfg)
         env.sim.qpos[:, 7 + 14] = env.sim.qpos[:, 7 + 18] = 1.45
         env.state = env.reader.read()
-        env.upper_body.send(env.state, env.targets.current[:, 11:])
+        env.upper_body.send(env.state, env.targets.current[:, 11:], env.motions.current().velocity)
         stiffness.append(env.upper_body.stiffness[0])
     torch.testing.assert_close(stiffness[0][0], stiffness[1][0])
     assert (stiffness[0][1] - stiffness[1][1]).abs().max() > 1.0

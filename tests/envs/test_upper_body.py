@@ -149,7 +149,7 @@ def test_gain_errors_scale_elastic_torque_and_damping_but_not_gravity(make_env):
     ones = torch.ones(2, 8)
     plain = env.upper_body.torque(q, dq, now, ones, ones)
     gravity = env.upper_body._feedforward[1].flatten(1)
-    viscous = -2.0 * dq
+    viscous = -(env.upper_body.newest.damping @ dq.reshape(2, 2, 4, 1)).flatten(1)
     elastic = plain - gravity - viscous
     scaled = env.upper_body.torque(q, dq, now, 1.1 * ones, 0.9 * ones)
     torch.testing.assert_close(scaled, gravity + 1.1 * elastic + 0.9 * viscous, atol=1e-3, rtol=1e-3)

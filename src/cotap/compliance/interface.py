@@ -72,6 +72,8 @@ class ArmState:
     """(N, A, 3, 3) the hands' compliance through a moving torso, heading frame [m/N]; None counts as none."""
     hand_force_h: torch.Tensor | None = None
     """(N, A, 3) force on the hands from outside, heading frame [N]; None counts as none."""
+    target_velocity: torch.Tensor | None = None
+    """(N, A, n) how fast the reference moves [rad/s]; None counts as at rest."""
     fresh: torch.Tensor | None = None
     """(N,) bool: the episode has just begun and nothing is remembered; None counts as everywhere."""
     dt: float = 0.02

@@ -37,8 +37,9 @@ class LawConfig:
     """Condition number of the hand's Jacobian above which compliance gives way to PD (cotap; paper, equation 10)."""
     error: str = "joint"
     """joint: stiffness acts on joint errors (the paper). task: on the hand's, exact at any displacement (cotap)."""
-    damping: str = "pd"
-    """pd: the PD law's. critical: from stiffness and joint-space inertia (cotap)."""
+    damping: str = "critical"
+    """critical: from stiffness and joint-space inertia, on the rate at which joints leave their reference. pd: the PD
+    law's, on the rate of the joints (the paper; cotap)."""
     soft_gain: float = 30.0
     """Position gain [Nm/rad] (soft-pd)."""
     virtual_mass: float = 1.0
@@ -122,17 +123,19 @@ class CoTaPLaw:
         if self._cfg.error == "task":
             error = self._task_error(state, blend, error)
         up_t = state.to_heading[:, 2]
-        gravity = gravity_torque(self._arms.inertias, state.pose, up_t)
         elastic = (blend.stiffness * error.unsqueeze(-2)).sum(-1)
+        feedforward = gravity_torque(self._arms.inertias, state.pose, up_t)
         if self._cfg.damping == "critical":
             damping = critical_damping(blend.stiffness, joint_inertia(self._arms.inertias, state.pose))
+            if state.target_velocity is not None:
+                feedforward = feedforward + (damping * state.target_velocity.unsqueeze(-2)).sum(-1)
         else:
             damping = self._damping.expand(n, -1, -1, -1)
         report = {
             "alpha": blend.ratio, "projected": projected.float(), "smallest_eigenvalue": blend.eigenvalue_range[..., 0],
             "largest_eigenvalue": blend.eigenvalue_range[..., 1],
         }  # fmt: skip
-        return TorqueLaw(state.position, gravity, elastic, blend.stiffness, damping), LawReport(report)
+        return TorqueLaw(state.position, feedforward, elastic, blend.stiffness, damping), LawReport(report)
 
     def _task_error(self, state: ArmState, blend: ArmStiffness, joint_error: torch.Tensor) -> torch.Tensor:
         """`J# (x_target - x) + N (q_target - q)`; back to the joint error where the blend goes back to PD."""

@@ -32,7 +32,8 @@ def default(base: BaseTraining) -> DistillTraining:
     env.assist.enabled = False
     env.commands.step_timing = True
     env.commands.step_apart_m, env.commands.step_clear_m = STEP_APART_M, STEP_CLEAR_M
-    env.upper_body.left.name = env.upper_body.right.name = "cotap"
+    for law in (env.upper_body.left, env.upper_body.right):
+        law.name, law.damping = "cotap", "critical"
     env.upper_body.sampling.enabled = True
     env.upper_body.sampling.full_alpha = 0.25
     # The base has taken smaller ones already. From here on one blow in six may throw the robot, and all are hard.
@@ -52,8 +53,10 @@ def default(base: BaseTraining) -> DistillTraining:
 
 
 def paper(base: BaseTraining) -> DistillTraining:
-    """The paper's range of stiffness (its Table II)."""
+    """The paper's range of stiffness (its Table II), and PD's damping."""
     training = default(base)
+    arms = training.env.upper_body
+    arms.left.damping = arms.right.damping = "pd"
     sampling = training.env.upper_body.sampling
     sampling.stiffness, sampling.full_alpha = (150.0, 450.0), 0.0
     return training

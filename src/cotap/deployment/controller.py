@@ -161,7 +161,7 @@ class Controller:
         law = pd_law(self._kp, self._kd, targets)
         if not self.upper_body.active:
             return law
-        self.upper_body.send(s, torch.from_numpy(targets[self._num_lower :]).unsqueeze(0))
+        self.upper_body.send(s, torch.from_numpy(targets[self._num_lower :]).unsqueeze(0), reference.velocity.double())
         return law.with_arms(self.upper_body.newest, self._num_lower)
 
 

@@ -240,7 +240,8 @@ def statics(spec: RobotSpec, laws: UpperBodyConfig, qpos: np.ndarray, force_z: f
     reader = StateReader(spec, EngineState(engine), torch.float64)
     state = reader.read()
     body = UpperBody(laws, spec, 1, H1EnvConfig().control_dt, torch.float64)
-    body.send(state, state.joint_pos[:, len(spec.lower_joints) :])
+    arms = state.joint_pos[:, len(spec.lower_joints) :]
+    body.send(state, arms, torch.zeros_like(arms))
     to_heading = state.heading_w.transpose(1, 2) @ state.torso_rotation_w
     jacobian = (to_heading.unsqueeze(1) @ reader.arm_chains.jacobian(state.arms))[0]
     compliance = jacobian @ torch.linalg.inv(body.newest.stiffness[0]) @ jacobian.transpose(-1, -2)

@@ -443,7 +443,7 @@ class H1Env(VecEnv):
             return
         arms = slice(self.num_lower, None)
         self._arm_effort.zero_()
-        self.upper_body.send(self.state, self.targets.current[:, arms])
+        self.upper_body.send(self.state, self.targets.current[:, arms], self.motions.current().velocity)
         kp, kd = self.upper_body.implicit_gains()
         self._kp[:, arms], self._kd[:, arms] = kp, kd
         bias = self.sim.field("actuator_biasprm")

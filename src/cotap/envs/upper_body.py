@@ -179,14 +179,18 @@ class UpperBody(Stateful):
         p.alpha[mask] = torch.where(full, cfg.alpha[1], uniform(rng, *cfg.alpha, n, arms))
         self._hold_s[mask] = uniform(rng, *cfg.hold_s, n)
 
-    def send(self, state: RobotState, target: torch.Tensor) -> None:
-        """Ask the laws, for targets (N, U) sent at the start of a control step."""
-        q, dq, wanted = (
-            x.reshape(self._shape) for x in (self._upper(state.joint_pos), self._upper(state.joint_vel), target)
+    def send(self, state: RobotState, target: torch.Tensor, velocity: torch.Tensor) -> None:
+        """Ask the laws, for targets (N, U) sent at the start of a control step, of a reference that moves at `velocity`
+        (N, U) [rad/s]."""
+        q, dq, wanted, rate = (
+            x.reshape(self._shape)
+            for x in (self._upper(state.joint_pos), self._upper(state.joint_vel), target, velocity)
         )
         to_heading = state.heading_w.transpose(1, 2) @ state.torso_rotation_w
         base = self._torso.hand_compliance(state, to_heading)
-        arms = ArmState(q, dq, wanted, state.arms, to_heading, base, fresh=self.fresh, dt=self._dt)
+        arms = ArmState(
+            q, dq, wanted, state.arms, to_heading, base, target_velocity=rate, fresh=self.fresh, dt=self._dt
+        )
         new, self.log = self._ask(arms)
         tensors = (new.anchor, new.feedforward, new.elastic, new.stiffness, new.damping)
         for name, value in zip(self.STATE[2:], tensors, strict=True):

@@ -24,7 +24,7 @@ class LawOptions:
     """Share of compliance in its blend with PD (cotap, hmc)."""
     error: str = "joint"
     """What stiffness acts on: joint or task error."""
-    damping: str = "pd"
+    damping: str = "critical"
     """pd or critical."""
     virtual_mass: float = 1.0
     """Mass of the hand's model [kg] (facet, hmc)."""

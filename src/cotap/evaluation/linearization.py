@@ -76,8 +76,9 @@ def linearize(
         if memory is not None and isinstance(law, Remembering):
             law.memory = dict(memory)
         state = ArmState(
-            at, rate, target, arms.chains.pose(at), upright, None, force, beginning if memory is None else later, dt
-        )
+            at, rate, target, arms.chains.pose(at), upright, hand_force_h=force,
+            fresh=beginning if memory is None else later, dt=dt,
+        )  # fmt: skip
         answer, _ = law(state, parameters)
         return answer, dict(law.memory) if isinstance(law, Remembering) else {}
 

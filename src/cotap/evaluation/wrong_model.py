@@ -38,10 +38,10 @@ class MisjudgingUpperBody(UpperBody):
         super().__init__(cfg, believed, num_envs, dt)
         self._chains = arm_chains(believed)
 
-    def send(self, state: RobotState, target: torch.Tensor) -> None:
+    def send(self, state: RobotState, target: torch.Tensor, velocity: torch.Tensor) -> None:
         """As ever, with the arms where the wrong model has them."""
         q = self._upper(state.joint_pos).reshape(self._shape)
-        super().send(replace(state, arms=self._chains.pose(q)), target)
+        super().send(replace(state, arms=self._chains.pose(q)), target, velocity)
 
 
 def misjudge(env: H1Env, length: float, mass: float) -> None:
