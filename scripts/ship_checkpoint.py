@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cotap.agents.checkpoint import load_checkpoint, save_checkpoint, sha256, write_json
+from cotap.envs.commands import STEP_APART_M, STEP_CLEAR_M
 from cotap.evaluate import main as evaluate
 from cotap.evaluation.policy import checkpoint_path
 
@@ -48,10 +49,14 @@ def earlier_runs(run_dirs: list[Path]) -> list[dict[str, Any]]:
     return [{key: run[key] for key in ("command", "commit")} for run in runs]
 
 
-def ship(source: Path, name: str, before: list[Path]) -> int:
-    """Strip, save, describe, evaluate. Returns the exit status."""
+def ship(source: Path, name: str, before: list[Path], keep_feet_apart: bool = False) -> int:
+    """Strip, save, describe, evaluate; with feet kept apart even if they were not in training. Returns the exit
+    status."""
     earlier = earlier_runs(before)
     content = load_checkpoint(source)
+    if keep_feet_apart:
+        widths = {"step_apart_m": STEP_APART_M, "step_clear_m": STEP_CLEAR_M}
+        content["config"]["training"]["env"]["commands"].update(widths)
     target = checkpoint_path(name)
     target.parent.mkdir(exist_ok=True)
     # Where the machine keeps the repository is nobody's business.
@@ -89,8 +94,11 @@ def main() -> int:
         "--before", type=Path, nargs="*", default=[], metavar="RUN_DIR",
         help="folders of the runs that this one went on from, oldest first",
     )  # fmt: skip
+    parser.add_argument(
+        "--keep-feet-apart", action="store_true", help="as distillation has it by now, whatever it was in training"
+    )
     options = parser.parse_args()
-    return ship(options.checkpoint, options.name, options.before)
+    return ship(options.checkpoint, options.name, options.before, options.keep_feet_apart)
 
 
 if __name__ == "__main__":

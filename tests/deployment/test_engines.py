@@ -114,6 +114,19 @@ def test_torque_limits_hold(engine, spec, gains):
     assert -18.0 * 0.005 / 0.05 < rates[0] < -18.0 * 0.005 / 0.2
 
 
+def test_links_that_touch_are_named(engine, spec, gains):
+    kp, kd, default = gains
+    crossed = default.copy()
+    crossed[spec.indices(["left_hip_roll", "right_hip_roll"])] = -0.27, 0.27  # soles 3 cm beyond each other
+    for pose, legs in ((default, set()), (crossed, {"left", "right"})):
+        engine.reset(np.concatenate(([0.0, 0.0, 3.0, 1.0, 0.0, 0.0, 0.0], pose)), np.zeros(25), 1.0)
+        engine.advance(pd_law(kp, kd, pose), 1, FREE)
+        touching = engine.touching()
+        assert {name.split("_")[0] for pair in touching for name in pair} == legs
+        assert all(first < second for first, second in touching)
+    assert any("ankle" in first and "ankle" in second for first, second in touching)
+
+
 def test_heavier_robots_sag_more(engine, spec, gains):
     kp, kd, default = gains
     sag = []

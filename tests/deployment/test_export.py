@@ -15,21 +15,33 @@ import pytest
 import torch
 
 from cotap.agents.actors import as_dict
-from cotap.agents.checkpoint import sha256
+from cotap.agents.checkpoint import load_checkpoint, save_checkpoint, sha256
 from cotap.configs import BASE_RECIPES, DISTILL_RECIPES
 from cotap.deployment import graph as graph_module
+from cotap.deployment.graph import export_policy
 from cotap.deployment.metadata import PolicyError
 from cotap.deployment.policy import OnnxPolicy, arm_advance
 from cotap.deployment.policy import main as timing
 from cotap.envs.actions import JointTargets
+from cotap.envs.commands import CommandConfig
 from cotap.envs.observations import ObservationHistory, actor_terms
 from cotap.evaluation.policy import load_policy, shipped_checkpoint
 from cotap.export import main as export
 
 
-def test_targets_are_the_environments_while_walking_standing_and_crouching(policy, make_env):
+@pytest.mark.parametrize(("apart_m", "clear_m"), [(0.0, 0.0), (0.04, 0.4)])
+def test_targets_are_the_environments_while_walking_standing_and_crouching(
+    apart_m, clear_m, policy, make_env, tmp_path
+):
     """The graph must contain all that the environment feeds forward; the arms' advance is added outside."""
-    env = make_env(6, collision="feet")
+    if clear_m:
+        content = load_checkpoint(shipped_checkpoint("base"))
+        widths = {"step_apart_m": apart_m, "step_clear_m": clear_m}
+        content["config"]["training"]["env"]["commands"].update(widths)
+        save_checkpoint(tmp_path / "apart.pt", content)
+        export_policy(tmp_path / "apart.pt", tmp_path / "apart.onnx", checks=20)
+        policy = OnnxPolicy(tmp_path / "apart.onnx")
+    env = make_env(6, collision="feet", commands=CommandConfig(step_apart_m=apart_m, step_clear_m=clear_m))
     env.cfg.hand_forces.enabled = False
     env.commands.override(
         torch.tensor([[0.7, 0.0], [-0.4, 0.3], [0.0, 0.0], [0.0, 0.0], [0.3, -0.2], [0.0, 0.0]]),
@@ -96,7 +108,7 @@ def test_a_distilled_policy_says_in_which_ranges_its_law_was_trained(spec, model
     training = DISTILL_RECIPES["default"](BASE_RECIPES["default"]())
     trained = load_policy(shipped_checkpoint("base"))
     history = ObservationHistory(actor_terms(19, 8), 1, 5)
-    targets = JointTargets(training.env.actions, spec, model, 0.8)
+    targets = JointTargets(training.env.actions, spec, model, training.env.commands)
     law = graph_module.describe(training.env, spec, targets, history, trained.model, "distill", "0" * 64).law
     assert law["left"]["name"] == "cotap"
     assert law["ranges"] == {"stiffness": [80.0, 1200.0], "null_stiffness": [24.0, 56.0], "alpha": [0.0, 1.0]}

@@ -256,6 +256,7 @@ def test_a_scenario_is_read_and_run(policy_file, tmp_path, spec, capsys):
     assert result["settings"]["perturbations"]["drop"] == 0.05
     assert result["metrics"]["e_lin"]["mean"] is None or result["metrics"]["e_lin"]["mean"] < 1.0
     assert [t["seconds"] for t in result["trials"]] == pytest.approx([1.0, 1.0])
+    assert [t["touched_s"] for t in result["trials"]] == [{}, {}]
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from cotap.envs.gait import StepMotion, desired_contact, sweep, swing_progress
+from cotap.envs.symmetry import joint_reflection
 
 PERIOD, STANCE = 0.8, 0.58
 
@@ -67,6 +68,76 @@ def test_soles_move_under_the_body_as_the_ground_would(spec, model, velocity, ya
     np.testing.assert_allclose(position, expected, atol=3e-3)
     assert np.arctan2(rotation[1, 0], rotation[0, 0]) == pytest.approx(half_stance_s * yaw_rate, abs=2e-3)
     assert rotation[0, 2] == pytest.approx(0.0, abs=5e-3)  # level fore and aft
+
+
+def test_feet_are_put_apart_by_what_is_asked(spec, model):
+    motion = StepMotion(spec, model, PERIOD, lift=0.0, stride=0.0, apart_m=0.06)
+    offsets = motion(torch.tensor([0.3]), torch.zeros(1, 2), torch.zeros(1))[0]
+    default = np.array([j.default_rad for j in spec.joints])
+    joints = default.copy()
+    for foot in range(2):
+        joints[motion.joints[foot].numpy()] += offsets[foot].numpy()
+    for foot, outward in ((0, 1.0), (1, -1.0)):
+        (was, _), (now, rotation) = sole(spec, model, default, foot), sole(spec, model, joints, foot)
+        assert now[1] - was[1] == pytest.approx(0.03 * outward, abs=1e-3)
+        # By rolling the leg: its height is left to change as it will.
+        np.testing.assert_allclose(now[[0, 2]], was[[0, 2]], atol=9e-3)
+        assert rotation[2, 1] == pytest.approx(outward * 0.03 / 0.83, abs=4e-3)
+
+
+def distance(spec, model, joints):
+    """Between soles, sideways [m]."""
+    return sole(spec, model, joints, 0)[0][1] - sole(spec, model, joints, 1)[0][1]
+
+
+@pytest.mark.parametrize(("phase", "swinging"), [(0.79, 0), (0.29, 1)])
+def test_the_swinging_foot_gives_way_by_what_is_missing(spec, model, phase, swinging):
+    motion = StepMotion(spec, model, PERIOD, clear_m=0.15)
+    roll = spec.indices(["left_hip_roll", "right_hip_roll"])
+    joints = np.array([j.default_rad for j in spec.joints])
+    rest, wide = torch.zeros(1, 19), torch.tensor(joints, dtype=torch.float32).unsqueeze(0)
+    assert not motion.giving_way(torch.tensor([phase]), wide, rest).any()
+    joints[roll] += -0.18, 0.18
+    near = distance(spec, model, joints)
+    assert 0.05 < near < 0.13
+    position = torch.tensor(joints, dtype=torch.float32).unsqueeze(0)
+    offsets = motion.giving_way(torch.tensor([phase]), position, rest)[0]
+    assert not offsets[1 - swinging].any()
+    joints[motion.joints[swinging].numpy()] += offsets[swinging].numpy()
+    assert distance(spec, model, joints) == pytest.approx(0.15, abs=5e-3)
+    # A foot that comes nearer is seen where it will be 0.1 s from now.
+    coming = rest.clone()
+    coming[:, roll] = torch.tensor([-1.0, 1.0])
+    ahead = motion.giving_way(torch.tensor([phase]), position, coming)[0, swinging] - offsets[swinging]
+    speed = (distance(spec, model, (position + 1e-3 * coming)[0].double().numpy()) - near) / 1e-3
+    expected = offsets[swinging] * (-0.1 * speed / (0.15 - near))
+    torch.testing.assert_close(ahead, expected.float(), rtol=0.02, atol=1e-5)
+
+
+def test_giving_way_is_the_same_in_the_mirror(spec, model):
+    motion = StepMotion(spec, model, PERIOD, clear_m=0.4)
+    rng = torch.Generator().manual_seed(0)
+    default = torch.tensor([j.default_rad for j in spec.joints])
+    position, velocity = default + 0.2 * torch.randn(64, 19, generator=rng), torch.randn(64, 19, generator=rng)
+    phase = torch.rand(64, generator=rng)
+    mirror = joint_reflection(spec, spec.joint_names)
+
+    def moved(phase, position, velocity):
+        offsets = torch.zeros(64, 19)
+        offsets[:, motion.joints] = motion.giving_way(phase, position, velocity)
+        return offsets
+
+    here = moved(phase, position, velocity)
+    assert here.any(1).sum() > 8
+    there = moved((phase + 0.5).remainder(1.0), mirror(position), mirror(velocity))
+    torch.testing.assert_close(there, mirror(here), atol=1e-4, rtol=1e-3)
+
+
+def test_feet_never_give_way_unless_asked_to(spec, model):
+    motion = StepMotion(spec, model, PERIOD)
+    crossed = torch.tensor([[j.default_rad for j in spec.joints]])
+    crossed[:, spec.indices(["left_hip_roll", "right_hip_roll"])] = torch.tensor([-0.3, 0.3])
+    assert not motion.giving_way(torch.tensor([0.79]), crossed, torch.zeros(1, 19)).any()
 
 
 def test_factors_scale_lift_and_stride_apart(spec, model):

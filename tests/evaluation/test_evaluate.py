@@ -87,6 +87,7 @@ def test_loaded_policy_is_deterministic_and_reads_430_numbers():
         ([*SMALL, "--checkpoint", "nowhere.pt"], "nowhere.pt"),
         ([*SMALL, "--json", "no/such/folder/x.json"], "no/such/folder"),
         ([*SMALL, "--torque-limit-scale", "-1"], "torque_limit_scale"),
+        ([*SMALL, "--collision", "arms"], "collision 'arms'"),
     ],
 )
 def test_bad_input_is_named(options: list[str], says: str, capsys: pytest.CaptureFixture[str]):

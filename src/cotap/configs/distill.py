@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 from cotap.agents.distillation import DistillationConfig
 from cotap.configs.base import BaseTraining, reward_as_facet
+from cotap.envs.commands import STEP_APART_M, STEP_CLEAR_M
 
 
 @dataclass
@@ -30,6 +31,7 @@ def default(base: BaseTraining) -> DistillTraining:
     env = training.env
     env.assist.enabled = False
     env.commands.step_timing = True
+    env.commands.step_apart_m, env.commands.step_clear_m = STEP_APART_M, STEP_CLEAR_M
     for law in (env.upper_body.left, env.upper_body.right):
         law.name, law.damping = "cotap", "critical"
     env.upper_body.sampling.enabled = True

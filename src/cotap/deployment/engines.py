@@ -74,6 +74,10 @@ class Engine(Protocol):
         """
         ...
 
+    def touching(self) -> set[tuple[str, str]]:
+        """Pairs of the robot's own links that touch each other, in the alphabet's order."""
+        ...
+
     def close(self) -> None:
         """Give back what the engine holds."""
         ...

@@ -95,7 +95,7 @@ def export_policy(checkpoint: Path | str, output: Path, checks: int = 1000, seed
             )
     if policy.model.layout.obs_groups["actor"] != ["policy"]:
         raise CheckpointError(f"checkpoint {str(checkpoint)!r}: actors read more than their observation")
-    targets = JointTargets(cfg.actions, spec, build_model(spec), cfg.commands.gait_period_s)
+    targets = JointTargets(cfg.actions, spec, build_model(spec), cfg.commands)
     graph = ActorGraph(policy.model, targets, history).eval()
     metadata = describe(cfg, spec, targets, history, policy.model, policy.stage, sha256(checkpoint))
     worst = 0.0

@@ -72,6 +72,12 @@ class MujocoEngine:
             data.ctrl[:] = law.torque(q, dq) + damping * dq
             mujoco.mj_step(model, data)
 
+    def touching(self) -> set[tuple[str, str]]:
+        """As `Engine.touching`."""
+        bodies = self.model.geom_bodyid[self.data.contact.geom]
+        pairs = (sorted(self.model.body(b).name for b in pair) for pair in bodies[(bodies > 0).all(1)])
+        return {(first, second) for first, second in pairs}
+
     def close(self) -> None:
         """As `Engine.close`."""
 

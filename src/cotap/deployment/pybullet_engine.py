@@ -106,6 +106,14 @@ class PybulletEngine:
         self._read_base()
         self._read_feet()
 
+    def touching(self) -> set[tuple[str, str]]:
+        """As `Engine.touching`."""
+        names = {link: name for name, link in self._links.items()}
+        # Bullet also lists shapes that are only near each other.
+        touching = [c for c in self._bullet.getContactPoints(self._robot, self._robot) if c[8] <= 0.0]
+        pairs = (sorted((names[c[3]], names[c[4]])) for c in touching)
+        return {(first, second) for first, second in pairs}
+
     def close(self) -> None:
         """As `Engine.close`."""
         self._bullet.disconnect()

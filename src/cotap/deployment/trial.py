@@ -36,6 +36,8 @@ class Trial:
     stopped: str = ""
     """Why the robot stopped itself; empty if it did not."""
     stopped_at_s: float | None = None
+    touched_s: dict[str, float] = field(default_factory=dict)
+    """For how long pairs of the robot's own links touched each other before it fell [s]: tripping over itself."""
     fell: bool = False
     """Too low or too tilted, or stopped: what a stopped robot goes on to do is no merit of its policy."""
 
@@ -95,6 +97,9 @@ def run_trial(
         truth = robot.truth()
         down = bool(fallen(falling, truth.height, truth.projected_gravity_t))
         trial.fell = trial.fell or down or bool(trial.stopped)
+        for pair in () if trial.fell else sorted(robot.engine.touching()):
+            name = " and ".join(pair)
+            trial.touched_s[name] = trial.touched_s.get(name, 0.0) + dt
         trial.rows.append(_row(robot, controller, truth, push, trial.fell))
         trial.qpos.append(robot.engine.qpos.copy())
         if trial.fell:

@@ -82,7 +82,8 @@ def report(
         "seconds": time.perf_counter() - started,
         "metrics": {name: summarize(value, seed) for name, value in measures.items()},
         "trials": [
-            {"seconds": len(t.rows) * t.dt, "fell": t.fell, "stopped": t.stopped, "stopped_at_s": t.stopped_at_s}
+            {"seconds": len(t.rows) * t.dt, "fell": t.fell, "stopped": t.stopped, "stopped_at_s": t.stopped_at_s,
+             "touched_s": t.touched_s}
             for t in trials
         ],
     }  # fmt: skip

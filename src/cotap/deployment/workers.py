@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 from concurrent.futures import Executor, ProcessPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -76,7 +77,7 @@ def _packed(trial: Trial) -> tuple[Trial, dict[str, np.ndarray]]:
     """A trial, and its rows as one array per column: thousands of small tensors are slow to send."""
     names = trial.rows[0] if trial.rows else {}
     columns = {name: torch.stack([row[name] for row in trial.rows]).numpy() for name in names}
-    return Trial(trial.dt, [], trial.qpos, trial.stopped, trial.stopped_at_s, trial.fell), columns
+    return replace(trial, rows=[]), columns
 
 
 def _unpacked(packed: tuple[Trial, dict[str, np.ndarray]]) -> Trial:

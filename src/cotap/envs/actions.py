@@ -10,7 +10,7 @@ import mujoco
 import torch
 
 from cotap.checks import require_one_of, require_range
-from cotap.envs.commands import Command
+from cotap.envs.commands import Command, CommandConfig
 from cotap.envs.gait import StepMotion
 from cotap.envs.stance import StanceBalance
 from cotap.robots import RobotSpec
@@ -59,13 +59,16 @@ class JointTargets:
     A function of what an observation holds and of nothing else, so that an exported policy can contain it.
     """
 
-    def __init__(self, cfg: ActionConfig, spec: RobotSpec, model: mujoco.MjModel, gait_period_s: float) -> None:
+    def __init__(self, cfg: ActionConfig, spec: RobotSpec, model: mujoco.MjModel, commands: CommandConfig) -> None:
         cfg.check()
         self.cfg = cfg
         self.default = torch.tensor([j.default_rad for j in spec.joints])
         """(J,) [rad]."""
         self.num_lower = len(spec.lower_joints)
-        self.steps = StepMotion(spec, model, gait_period_s, cfg.step_lift, cfg.step_stride)
+        self.steps = StepMotion(
+            spec, model, commands.gait_period_s, cfg.step_lift, cfg.step_stride, commands.step_apart_m,
+            commands.step_clear_m,
+        )  # fmt: skip
         self.stance = StanceBalance(spec, model)
         twists = [j.axis == (0.0, 0.0, 1.0) for j in spec.joints]
         self.scale = torch.tensor([cfg.twist_scale if twist else cfg.lower_scale for twist in twists])
@@ -89,6 +92,7 @@ class JointTargets:
         """
         target = self.default + self.scale * action
         step = self.steps(command.phase, command.velocity_h, command.yaw_rate)
+        step = step + self.steps.giving_way(command.phase, joint_pos, joint_vel)
         target[:, self.steps.joints] += (1.0 - command.stand)[:, None, None] * step
         legs = self.stance.joints
         stance = self.stance(command.height, joint_pos, joint_vel, projected_gravity, angular_velocity)

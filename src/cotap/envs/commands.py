@@ -16,6 +16,10 @@ STEADY_RAD = 0.2
 TURNED_RAD_S = 1.0
 """Yaw rate from which a robot counts as turned by a blow [rad/s]; balance is lost at less, and then says nothing."""
 
+STEP_APART_M, STEP_CLEAR_M = 0.04, 0.15
+"""How much further apart feet are put, and how close they may come, from distillation on [m]. In training they pass
+through each other, and they do."""
+
 HURRY = 1.3
 """How much faster the gait clock of a robot runs that catches itself."""
 
@@ -49,6 +53,10 @@ class CommandConfig:
     Evaluation uses `STEADY_RAD`. Training does without (10): a robot that always steps never learns to stand."""
     gait_period_s: float = 0.8
     """Duration of a stride [s]."""
+    step_apart_m: float = 0.0
+    """How much further apart than in the default pose feet are put while stepping [m]."""
+    step_clear_m: float = 0.0
+    """Sideways distance of the soles below which the swinging leg rolls outwards while stepping; 0 for never [m]."""
     step_timing: bool = False
     """Whether the gait clock jumps to where a robot that was struck catches itself (`StepTiming`)."""
 
@@ -64,6 +72,8 @@ class CommandConfig:
         require_range("commands.yaw_acceleration", self.yaw_acceleration, 1e-2, 1e3)
         require_range("commands.steady_rad", self.steady_rad, 0.0, 10.0)
         require_range("commands.gait_period_s", self.gait_period_s, 0.1, 10.0)
+        require_range("commands.step_apart_m", self.step_apart_m, 0.0, 0.5)
+        require_range("commands.step_clear_m", self.step_clear_m, 0.0, 0.5)
 
 
 @dataclass(frozen=True)

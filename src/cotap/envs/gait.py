@@ -9,9 +9,13 @@ import numpy as np
 import torch
 
 from cotap.robots import RobotSpec
+from cotap.robots.chains import chains_between
 
 STANCE_SHARE = 0.58
 """Part of a stride that a foot spends on the ground."""
+
+AHEAD_S = 0.1
+"""How far ahead the swinging foot is seen coming at the other one: about what a leg takes to give way [s]."""
 
 
 def foot_phases(phase: torch.Tensor, num_feet: int) -> torch.Tensor:
@@ -42,7 +46,8 @@ def sweep(phase: torch.Tensor, num_feet: int) -> torch.Tensor:
 
 
 class StepMotion:
-    """Joint offsets of the legs that lift the swinging foot and sweep both feet under a body that moves as commanded.
+    """Joint offsets of the legs that lift the swinging foot and sweep both feet under a body that moves as commanded,
+    and that keep feet out of each other's way.
 
     The sweep is kinematics of the first order about the default pose: the least-squares solution that moves a sole
     forward, sideways and in yaw, and keeps it level and at its height.
@@ -53,11 +58,14 @@ class StepMotion:
         period_s: Duration of a stride [s].
         lift: Factor on the lift of the swinging foot.
         stride: Factor on the sweep.
+        apart_m: How much further apart than in the default pose the feet are put.
+        clear_m: Sideways distance of two soles below which the swinging one gives way; 0 for never.
     """
 
     def __init__(
-        self, spec: RobotSpec, model: mujoco.MjModel, period_s: float, lift: float = 1.0, stride: float = 1.0
-    ) -> None:
+        self, spec: RobotSpec, model: mujoco.MjModel, period_s: float, lift: float = 1.0, stride: float = 1.0,
+        apart_m: float = 0.0, clear_m: float = 0.0,
+    ) -> None:  # fmt: skip
         chains = [spec.chain(foot.body, spec.base_body) for foot in spec.feet]
         names = [[b.joint or "" for b in chain] for chain in chains]
         self.joints = torch.tensor([spec.indices(chain) for chain in names])
@@ -66,10 +74,14 @@ class StepMotion:
         for i, foot in enumerate(spec.feet):
             for joint, angle in foot.flexion:
                 self._lift[i, names[i].index(joint)] = lift * angle
-        maps, lateral = zip(*(_sole_kinematics(spec, model, i, names[i]) for i in range(len(spec.feet))), strict=True)
+        kinematics = [_sole_kinematics(spec, model, i, names[i]) for i in range(len(spec.feet))]
+        maps, outward, lateral = zip(*kinematics, strict=True)
         # Half of the way that the ground moves during a stance, per unit of velocity.
         self._per_velocity = 0.5 * stride * STANCE_SHARE * period_s * torch.stack(maps)
         self._lateral = torch.tensor(lateral)
+        self._outward = torch.stack(outward)
+        self._apart, self._clear = 0.5 * apart_m * self._outward, clear_m
+        self._chains = chains_between(spec, spec.base_body, [(foot.body, foot.sole) for foot in spec.feet])
 
     def __call__(self, phase: torch.Tensor, velocity_h: torch.Tensor, yaw_rate: torch.Tensor) -> torch.Tensor:
         """Offsets (N, F, n) [rad] for the clock's phase (N,), velocities (N, 2) and yaw rates (N,)."""
@@ -79,13 +91,31 @@ class StepMotion:
         forward = velocity_h[:, :1] - yaw_rate.unsqueeze(1) * self._lateral
         rates = torch.stack((forward, velocity_h[:, 1:].expand(-1, feet), yaw_rate.unsqueeze(1).expand(-1, feet)), 2)
         stride = (self._per_velocity * rates.unsqueeze(2)).sum(3)
-        return bump.unsqueeze(2) * self._lift + sweep(phase, feet).unsqueeze(2) * stride
+        return self._apart + bump.unsqueeze(2) * self._lift + sweep(phase, feet).unsqueeze(2) * stride
+
+    def giving_way(self, phase: torch.Tensor, joint_pos: torch.Tensor, joint_vel: torch.Tensor) -> torch.Tensor:
+        """Offsets (N, F, n) [rad] that keep the swinging foot from the other one, the first two feet being a pair.
+
+        Args:
+            phase: (N,) of the clock.
+            joint_pos: (N, J) [rad].
+            joint_vel: (N, J) [rad/s].
+        """
+        if self._clear == 0.0:
+            return torch.zeros_like(self._outward).expand(len(phase), -1, -1)
+        pose = self._chains.pose(joint_pos[:, self.joints])
+        rate = (self._chains.jacobian(pose)[:, :, 1] * joint_vel[:, self.joints]).sum(2)
+        sideways = (pose.tip[:, :, 1] + AHEAD_S * rate) * self._lateral.sign()
+        short = (self._clear - sideways[:, 0] - sideways[:, 1]).clamp(0.0, 2.0 * self._clear)
+        swings = (swing_progress(phase, self.joints.shape[0]) > 0.0).to(short.dtype)
+        return (short.unsqueeze(1) * swings).unsqueeze(2) * self._outward
 
 
 def _sole_kinematics(
     spec: RobotSpec, model: mujoco.MjModel, foot: int, joints: list[str]
-) -> tuple[torch.Tensor, float]:
-    """Joint rates (n, 3) per unit of the sole's forward, sideways and yaw rate, and where the sole is sideways [m]."""
+) -> tuple[torch.Tensor, torch.Tensor, float]:
+    """Joint rates (n, 3) per unit of the sole's forward, sideways and yaw rate; angles (n,) that put it outwards, per
+    metre, by the least motion and whatever becomes of its height; and where it is sideways [m]."""
     data = mujoco.MjData(model)
     data.qpos[3] = 1.0
     data.qpos[7:] = [j.default_rad for j in spec.joints]
@@ -99,4 +129,6 @@ def _sole_kinematics(
     weight = np.array([1.0, 1.0, 1.0, 1e-3, 1.0, 1.0])
     jacobian = np.concatenate((position, rotation))[:, columns] * weight[:, None]
     inverse = np.linalg.pinv(jacobian) * weight
-    return torch.tensor(inverse[:, [0, 1, 5]], dtype=torch.float32), float(point[1])
+    outward = np.sign(point[1]) * np.linalg.pinv(position[1:2, columns])[:, 0]
+    rates = torch.tensor(inverse[:, [0, 1, 5]], dtype=torch.float32)
+    return rates, torch.tensor(outward, dtype=torch.float32), float(point[1])

@@ -177,7 +177,7 @@ class H1Env(VecEnv):
         self._sideways = tuple(
             i for i, j in enumerate(joints[: self.num_lower]) if j.mirror_sign < 0.0
         )  # yaw and roll joints
-        self.joint_targets = JointTargets(cfg.actions, spec, model, cfg.commands.gait_period_s)
+        self.joint_targets = JointTargets(cfg.actions, spec, model, cfg.commands)
 
         self.reader = StateReader(spec, self.sim)
         self.arm_limits = self.reader.arm_joints(self._torque_limit.unsqueeze(0))[0]

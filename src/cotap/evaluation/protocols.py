@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from cotap.checks import require_positive_int, require_range
+from cotap.checks import require_one_of, require_positive_int, require_range
 from cotap.envs import H1EnvConfig
 from cotap.envs.commands import STEADY_RAD
+from cotap.robots.mjcf import COLLISIONS
 
 
 @dataclass
@@ -47,6 +48,9 @@ class VelocityTracking:
     """Lead the torso along the clips' root path instead of drawing velocity commands."""
     torque_limit_scale: float = 1.0
     """Factor on the robot's torque limits."""
+    collision: str = ""
+    """feet (only feet meet the floor) or full (all shapes, each other too); empty keeps what the policy was trained
+    with."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
@@ -61,11 +65,14 @@ class VelocityTracking:
         require_range("steady_rad", self.steady_rad, 0.0, 10.0)
         require_range("hand_force", self.hand_force, 0.0, 1000.0)
         require_range("torque_limit_scale", self.torque_limit_scale, 1e-3, 1e3)
+        if self.collision:
+            require_one_of("collision", self.collision, COLLISIONS)
 
     def configure(self, env: H1EnvConfig) -> H1EnvConfig:
         """Turn the environment that a policy was trained in into this protocol's. Changes and returns `env`."""
         self.check()
         env.num_envs, env.seed, env.torque_limit_scale = self.num_envs, self.seed, self.torque_limit_scale
+        env.collision = self.collision or env.collision
         env.assist.enabled = env.blows.enabled = False
         env.observations.noise.enabled = False
         env.randomization.enabled = self.randomize
