@@ -23,7 +23,8 @@ from cotap.agents.actors import AgentLayout
 from cotap.agents.checkpoint import load_checkpoint
 from cotap.agents.dual_ppo import DualPPO, DualPPOConfig
 from cotap.agents.ranks import Ranks
-from cotap.agents.runner import DualRunner, RunnerConfig, TrainingFault, layout_of
+from cotap.agents.runner import DualRunner, TrainingFault, layout_of
+from cotap.agents.runner_config import RunnerConfig
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="processes are forked")
 SIZE = 2

@@ -18,7 +18,8 @@ from dummy_env import DummyEnv, make_runner
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from cotap.agents.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
-from cotap.agents.runner import DualRunner, RunnerConfig, TrainingFault, check_run_dir
+from cotap.agents.runner import DualRunner, TrainingFault, check_run_dir
+from cotap.agents.runner_config import RunnerConfig
 from cotap.envs import H1Env, H1EnvConfig
 from cotap.envs.observations import NoiseConfig, ObservationConfig
 from cotap.envs.terminations import TerminationConfig

@@ -9,7 +9,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -34,26 +33,9 @@ from cotap.agents.distillation import Guide
 from cotap.agents.dual_ppo import DualPPO, DualPPOConfig
 from cotap.agents.ranks import Ranks
 from cotap.agents.run_log import RunLog, Unfailing, say
-from cotap.checks import require_positive_int
+from cotap.agents.runner_config import RunnerConfig
 
 CHECKPOINT_PATTERN = "checkpoint_*.pt"
-
-
-@dataclass
-class RunnerConfig:
-    """How long to train and how often to save."""
-
-    iterations: int = 400
-    """Iterations in all, those of a resumed run included."""
-    save_interval: int = 25
-    """Iterations between checkpoints."""
-    save_worlds: bool = True
-    """Save every world's state (14 kB), so that a run goes on exactly; without, worlds start afresh."""
-
-    def check(self) -> None:
-        """Raise ValueError naming the first field that is out of its range."""
-        require_positive_int("runner.iterations", self.iterations)
-        require_positive_int("runner.save_interval", self.save_interval)
 
 
 def layout_of(env: VecEnv, symmetric: bool = True) -> AgentLayout:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import torch
 
 from cotap.agents.dual_ppo import DualPPOConfig
-from cotap.agents.runner import RunnerConfig
+from cotap.agents.runner_config import RunnerConfig
 from cotap.checks import require_range
 from cotap.envs import H1EnvConfig
 from cotap.envs.commands import STEADY_RAD

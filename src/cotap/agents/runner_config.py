@@ -1,0 +1,24 @@
+"""How long to train and how often to save: apart from the runner, whose imports a reader of configs does not need."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from cotap.checks import require_positive_int
+
+
+@dataclass
+class RunnerConfig:
+    """How long to train and how often to save."""
+
+    iterations: int = 400
+    """Iterations in all, those of a resumed run included."""
+    save_interval: int = 25
+    """Iterations between checkpoints."""
+    save_worlds: bool = True
+    """Save every world's state (14 kB), so that a run goes on exactly; without, worlds start afresh."""
+
+    def check(self) -> None:
+        """Raise ValueError naming the first field that is out of its range."""
+        require_positive_int("runner.iterations", self.iterations)
+        require_positive_int("runner.save_interval", self.save_interval)
