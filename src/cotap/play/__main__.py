@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING
 
 import tyro
 
+from cotap.play.lean import import_tensordict, uncollected
+
 if TYPE_CHECKING:
     from viser import ViserServer
 
@@ -51,7 +53,8 @@ def main(argv: list[str] | None = None) -> int:
 def _run(options: PlayOptions) -> int:
     begin = time.perf_counter()
     try:
-        from cotap.play.server import open_server
+        with uncollected():
+            from cotap.play.server import open_server
     except ImportError as error:
         raise ValueError(f"the page needs viser and mjviser ({error}): pip install 'cotap[play]'") from error
     server = open_server(options.host, options.port)
@@ -59,7 +62,8 @@ def _run(options: PlayOptions) -> int:
         # The page answers while torch, the policy and the model are still being loaded.
         loading = server.gui.add_markdown("Loading the simulation ...")
         print(f"open http://{'localhost' if options.host in ('127.0.0.1', '0.0.0.0') else options.host}:{options.port}")
-        app = _replay(options, server) if options.replay else _live(options, server)
+        with uncollected():
+            app = _replay(options, server) if options.replay else _live(options, server)
         loading.remove()
         print(f"ready after {time.perf_counter() - begin:.1f} s; Ctrl-C ends it", flush=True)
         app.run()
@@ -70,8 +74,6 @@ def _run(options: PlayOptions) -> int:
 
 def _live(options: PlayOptions, server: ViserServer) -> App:
     import torch
-
-    from cotap.play.lean import import_tensordict
 
     import_tensordict()  # before what would import it whole
 
@@ -87,8 +89,6 @@ def _live(options: PlayOptions, server: ViserServer) -> App:
 
 
 def _replay(options: PlayOptions, server: ViserServer) -> Replay:
-    from cotap.play.lean import import_tensordict
-
     import_tensordict()
 
     from cotap.evaluation.recording import load_recording
