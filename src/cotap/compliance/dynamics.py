@@ -49,17 +49,19 @@ def gravity_torque(links: LinkInertias, pose: ChainPose, up: torch.Tensor) -> to
 
 def joint_inertia(links: LinkInertias, pose: ChainPose) -> torch.Tensor:
     """Joint-space inertia (W, A, n, n) [kg m^2] of arms whose root does not move."""
-    joints = pose.axes.shape[2]
+    axes, joints = pose.axes, pose.axes.shape[2]
     centers = pose.anchors + rotate(pose.rotations, links.com)
     arm = centers.unsqueeze(2) - pose.anchors.unsqueeze(3)  # (W, A, joint, link, 3)
-    axes = pose.axes.unsqueeze(3).expand_as(arm)
-    moves = torch.tril(torch.ones(joints, joints, dtype=arm.dtype, device=arm.device)).T[..., None]
-    linear = torch.linalg.cross(axes, arm) * moves
-    angular = axes * moves
+    moves = torch.ones(joints, joints, dtype=arm.dtype, device=arm.device).triu()
+    weight = (moves * links.mass.sqrt().unsqueeze(-2)).unsqueeze(-1)
+    linear = (torch.linalg.cross(axes.unsqueeze(3).expand_as(arm), arm) * weight).flatten(-2)
     world = pose.rotations @ links.inertia @ pose.rotations.transpose(-1, -2)
-    spin = torch.einsum("waikx,wakxy,wajky->waij", angular, world, angular)
-    shift = torch.einsum("waikx,ak,wajkx->waij", linear, links.mass, linear)
-    return spin + shift + links.armature * torch.eye(joints, dtype=arm.dtype, device=arm.device)
+    # Two joints turn together what the one nearer to the hand carries.
+    carried = world.flip(2).cumsum(2).flip(2)
+    spin = axes @ (carried @ axes.unsqueeze(-1)).squeeze(-1).transpose(-1, -2)
+    spin = spin.triu() + spin.triu(1).transpose(-1, -2)
+    eye = torch.eye(joints, dtype=arm.dtype, device=arm.device)
+    return linear @ linear.transpose(-1, -2) + spin + links.armature * eye
 
 
 def critical_damping(stiffness: torch.Tensor, inertia: torch.Tensor, ratio: float = 1.0) -> torch.Tensor:
