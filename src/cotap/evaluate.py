@@ -210,12 +210,10 @@ def _prepare(options: CommonOptions, protocol: Any) -> tuple[H1Env, Policy, str]
 
 def _checkpoint(options: CommonOptions) -> Path:
     """The file that the options mean."""
-    from cotap.evaluation.policy import CHECKPOINTS, default_checkpoint, shipped_checkpoint
+    from cotap.evaluation.policy import default_checkpoint, find_checkpoint, shipped_checkpoint
 
-    if options.checkpoint in CHECKPOINTS:
-        return shipped_checkpoint(options.checkpoint)
     if options.checkpoint:
-        return Path(options.checkpoint)
+        return find_checkpoint(options.checkpoint)
     return shipped_checkpoint("base") if isinstance(options, VelocityTrackingOptions) else default_checkpoint()
 
 

@@ -18,7 +18,7 @@ class ExportOptions:
     output: str
     """Where the ONNX file goes."""
     checkpoint: str = ""
-    """Checkpoint to export; by default the shipped CoTaP policy."""
+    """Checkpoint to export, a file or the name of a shipped one; by default the shipped CoTaP policy."""
     checks: int = 1000
     """Observations over which the file is compared with torch before it is kept."""
     seed: int = 0
@@ -30,7 +30,7 @@ def main(argv: list[str] | None = None) -> int:
     options = tyro.cli(ExportOptions, args=argv, prog="python -m cotap.export")
     try:
         from cotap.deployment.graph import export_policy
-        from cotap.evaluation.policy import default_checkpoint
+        from cotap.evaluation.policy import default_checkpoint, find_checkpoint
 
         require_positive_int("checks", options.checks)
         output = Path(options.output)
@@ -38,7 +38,7 @@ def main(argv: list[str] | None = None) -> int:
             raise ValueError(f"--output must end in .onnx, got {options.output!r}")
         if not output.resolve().parent.is_dir():
             raise ValueError(f"--output {options.output!r}: its folder does not exist")
-        checkpoint = options.checkpoint or default_checkpoint()
+        checkpoint = find_checkpoint(options.checkpoint) if options.checkpoint else default_checkpoint()
         summary, worst = export_policy(checkpoint, output, options.checks, options.seed)
     except (ValueError, OSError, ModuleNotFoundError) as error:
         print(f"error: {error}", file=sys.stderr)

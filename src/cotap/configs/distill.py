@@ -50,7 +50,7 @@ def default(base: BaseTraining) -> DistillTraining:
     env.rewards.upper.stay_close = 1.0
     # The base's spread is where exploration goes on from, not where it began.
     training.ppo.initial_std = training.ppo.least_std
-    training.runner.iterations = 1698
+    training.runner.iterations = 2525
     return training
 
 

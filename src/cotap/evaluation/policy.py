@@ -36,6 +36,11 @@ def shipped_checkpoint(name: str = "base") -> Path:
     return path
 
 
+def find_checkpoint(given: str) -> Path:
+    """The file that is meant by a path or by the name of a shipped one. Raises ValueError for a name not shipped."""
+    return shipped_checkpoint(given) if given in CHECKPOINTS else Path(given)
+
+
 def default_checkpoint() -> Path:
     """What compliance is evaluated with: the distilled policy if it is shipped, else the base."""
     return shipped_checkpoint("cotap" if "cotap" in shipped_names() else "base")
