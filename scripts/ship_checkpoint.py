@@ -9,12 +9,23 @@ from pathlib import Path
 from typing import Any
 
 from cotap.agents.checkpoint import load_checkpoint, save_checkpoint, sha256, write_json
-from cotap.envs.commands import STEP_APART_M, STEP_CLEAR_M
 from cotap.evaluate import main as evaluate
 from cotap.evaluation.policy import checkpoint_path
 
 VELOCITY = ["velocity-tracking", "--num-envs", "1024"]
 SMALL = ["--num-envs", "64", "--threads", "1"]
+
+
+def ablation(*options: str) -> dict[str, list[str]]:
+    """What vouches for a policy that an ablation trained."""
+    arms = ["--method", "cotap", *options]
+    return {
+        "velocity-tracking": [*VELOCITY, *arms],
+        "velocity-tracking.small": ["velocity-tracking", "--episode-seconds", "10", *arms, *SMALL],
+        "impact.stance": ["impact", "--num-envs", "1024", *arms],
+    }
+
+
 EVALUATIONS = {
     "base": {
         "velocity-tracking": VELOCITY,
@@ -39,6 +50,9 @@ EVALUATIONS = {
         "velocity-tracking.small": ["velocity-tracking", "--episode-seconds", "10", "--method", "facet", *SMALL],
         "impact.stance": ["impact", "--num-envs", "1024", "--method", "facet"],
     },
+    "cotap-no-ratio": ablation("--no-singularity-ratio"),
+    "cotap-torque-critic": ablation(),
+    "cotap-goals": ablation(),
 }  # fmt: skip
 """What vouches for each policy; the small one is repeated by the tests."""
 
@@ -49,14 +63,10 @@ def earlier_runs(run_dirs: list[Path]) -> list[dict[str, Any]]:
     return [{key: run[key] for key in ("command", "commit")} for run in runs]
 
 
-def ship(source: Path, name: str, before: list[Path], keep_feet_apart: bool = False) -> int:
-    """Strip, save, describe, evaluate; with feet kept apart even if they were not in training. Returns the exit
-    status."""
+def ship(source: Path, name: str, before: list[Path]) -> int:
+    """Strip, save, describe, evaluate. Returns the exit status."""
     earlier = earlier_runs(before)
     content = load_checkpoint(source)
-    if keep_feet_apart:
-        widths = {"step_apart_m": STEP_APART_M, "step_clear_m": STEP_CLEAR_M}
-        content["config"]["training"]["env"]["commands"].update(widths)
     target = checkpoint_path(name)
     target.parent.mkdir(exist_ok=True)
     # Where the machine keeps the repository is nobody's business.
@@ -94,11 +104,8 @@ def main() -> int:
         "--before", type=Path, nargs="*", default=[], metavar="RUN_DIR",
         help="folders of the runs that this one went on from, oldest first",
     )  # fmt: skip
-    parser.add_argument(
-        "--keep-feet-apart", action="store_true", help="as distillation has it by now, whatever it was in training"
-    )
     options = parser.parse_args()
-    return ship(options.checkpoint, options.name, options.before, options.keep_feet_apart)
+    return ship(options.checkpoint, options.name, options.before)
 
 
 if __name__ == "__main__":

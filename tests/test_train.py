@@ -407,6 +407,40 @@ def test_a_shipped_distilled_policy_goes_on_under_the_base_it_is_given(checkpoin
         assert torch.equal(newest(tmp_path / "more")["learner"]["guide"][key], value), key
 
 
+@pytest.mark.parametrize(("recipe", "wider"), [("goals", 50), ("torque-critic", -40)])
+def test_an_ablation_goes_on_from_a_policy_that_saw_something_else(
+    checkpoint: Path, tmp_path: Path, recipe: str, wider: int
+):
+    before = distill(tmp_path / "run", checkpoint)
+    more = [RECIPE, recipe, BASE_CHECKPOINT, checkpoint, ITERATIONS, 1, RUN_DIR, tmp_path / "more"]
+    assert run("distill", RESUME, max((tmp_path / "run").glob("checkpoint_*.pt")), *more) == 0
+    after = newest(tmp_path / "more")
+    key = "actors.lower.weights.0"
+    assert after["model"][key].shape[1] == before["model"][key].shape[1] + wider
+    assert after["config"]["training"]["distillation"]["beta"] == 0.0  # it has been guided
+    assert after["iteration"] == 1
+    # And goes on as any other.
+    assert run("distill", RESUME, max((tmp_path / "more").glob("checkpoint_*.pt")), RECIPE, recipe, ITERATIONS, 2) == 0
+    assert newest(tmp_path / "more")["iteration"] == 2
+
+
+@pytest.mark.parametrize("recipe", ["paper", "facet"])
+def test_a_recipe_that_begins_from_a_base_does_not_resume_a_distillation(
+    checkpoint: Path, tmp_path: Path, recipe: str, capsys: pytest.CaptureFixture[str]
+):
+    distill(tmp_path / "run", checkpoint)
+    assert run("distill", RESUME, max((tmp_path / "run").glob("checkpoint_*.pt")), RECIPE, recipe) == 2
+    said = capsys.readouterr().err
+    assert "recipe with --resume" in said
+    assert "no-ratio" in said
+
+
+def test_an_ablation_begins_from_a_base_that_saw_something_else(checkpoint: Path, tmp_path: Path):
+    content = distill(tmp_path / "run", checkpoint, RECIPE, "goals")
+    assert content["learner"]["guide"]["actors.lower.weights.0"][:, -50:].abs().max() == 0.0
+    assert content["config"]["training"]["distillation"]["beta"] > 0.0
+
+
 def test_the_papers_range_is_a_recipe(checkpoint: Path, tmp_path: Path):
     content = distill(tmp_path / "run", checkpoint, RECIPE, "paper")
     assert content["config"]["training"]["env"]["upper_body"]["sampling"]["stiffness"] == [150.0, 450.0]

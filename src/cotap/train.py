@@ -19,7 +19,9 @@ from cotap.checks import require_one_of, require_positive_int, require_range
 from cotap.configs import (
     BASE_RECIPES,
     CONTINUATIONS,
+    DISTILL_CONTINUATIONS,
     DISTILL_RECIPES,
+    OTHER_TERMS,
     BaseTraining,
     DistillTraining,
     from_plain,
@@ -44,8 +46,8 @@ class BaseOptions:
     """Checkpoint to go on from; its config is the default for every option. auto: the newest in --run-dir, if any."""
     recipe: str = "default"
     """default (from nothing to walking); paper (the same with the paper's networks); robust (blows and loads on the
-    hands: with --resume, what a policy that walks learns next, from nothing without it); for ablations,
-    torque-critic or goals (other observations), or facet (FACET's tracking reward)."""
+    hands: with --resume, what a policy that walks learns next, from nothing without it); or facet (FACET's tracking
+    reward)."""
     command: tyro.conf.Suppress[str] = ""
     training: Annotated[BaseTraining, tyro.conf.arg(name="")] = field(default_factory=BASE_RECIPES["default"])
 
@@ -61,12 +63,13 @@ class DistillOptions:
     """Where the run goes; by default runs/distill-DATE-TIME, or the resumed checkpoint's folder."""
     resume: str = ""
     """Checkpoint of a distillation to go on from; its config is the default for every option. auto: the newest in
-    --run-dir, if any."""
+    --run-dir, if any. A shipped one is guided no more."""
     base_checkpoint: str = ""
     """Base policy to begin from and to be guided by; by default the shipped one."""
     recipe: str = "default"
     """default (80 to 1200 N/m); paper (150 to 450 N/m); facet (arms under FACET, its tracking reward);
-    or an ablation: no-ratio, torque-critic, goals."""
+    or an ablation: no-ratio, torque-critic, goals. With --resume an ablation changes that checkpoint's config. The last
+    two change what the networks see; those that they begin from are refitted."""
     command: tyro.conf.Suppress[str] = ""
     training: Annotated[DistillTraining, tyro.conf.arg(name="")] = field(default_factory=DistillTraining)
 
@@ -174,13 +177,19 @@ def _parse_distill(args: list[str]) -> DistillOptions:
     from cotap.evaluation.policy import shipped_checkpoint
 
     args = _expand(args)
-    recipe = require_one_of("recipe", _peek(args, "--recipe") or "default", DISTILL_RECIPES.keys())
-    resumed, base = _peek(args, "--resume"), _peek(args, "--base-checkpoint")
-    if not base and not (resumed and _brings_guide(resumed)):
-        base = str(shipped_checkpoint("base"))
+    given, resumed, base = (_peek(args, option) for option in ("--recipe", "--resume", "--base-checkpoint"))
+    recipe = require_one_of("recipe", given or "default", DISTILL_RECIPES.keys())
     if resumed:
-        training = _config_of(resumed, DistillTraining)
+        before = training = _config_of(resumed, DistillTraining)
+        if given:
+            require_one_of("recipe with --resume", given, DISTILL_CONTINUATIONS.keys())
+            training = DISTILL_CONTINUATIONS[given](training)
+        guided = _brings_guide(resumed) and training.env.observations == before.env.observations
+        if not guided:  # what the base had to say has been learned; iterations count from nothing, and so would beta
+            training.distillation.beta = 0.0
+            base = base or str(shipped_checkpoint("base"))
     else:
+        base = base or str(shipped_checkpoint("base"))
         training = DISTILL_RECIPES[recipe](_config_of(base, BaseTraining))
     default = DistillOptions(recipe=recipe, base_checkpoint=base, training=training)
     return tyro.cli(DistillOptions, args=args, default=default, prog="python -m cotap.train distill")
@@ -265,7 +274,7 @@ def _train(stage: str, options: BaseOptions | DistillOptions, base: dict[str, An
         if ranks.size > 1:
             torch.manual_seed(training.env.seed)
         if options.resume:
-            runner.load(options.resume)
+            runner.load(options.resume, other_terms=options.recipe in OTHER_TERMS)
         # Last, so that nothing is left behind when any of the above refuses.
         if ranks.leads:
             check_run_dir(run_dir, resuming=resumed_dir is not None and run_dir.resolve() == resumed_dir.resolve())
@@ -277,21 +286,15 @@ def _train(stage: str, options: BaseOptions | DistillOptions, base: dict[str, An
 
 def _guide(env: Any, options: DistillOptions, base: dict[str, Any] | None) -> Any:
     """The frozen base; of a resumed run, one whose weights the checkpoint brings."""
-    import json
-
     from cotap.agents.actors import DualActorCritic
-    from cotap.agents.checkpoint import MALFORMED, CheckpointError, require_layout
     from cotap.agents.distillation import Guide
+    from cotap.agents.refit import take_over
     from cotap.agents.runner import layout_of
 
     training = options.training
     model = DualActorCritic(layout_of(env, training.ppo.symmetric), training.ppo.hidden, training.ppo.initial_std)
     if base is not None:
-        require_layout(options.base_checkpoint, base["layout"], json.loads(json.dumps(env.layout())))
-        try:
-            model.load_state_dict(base["model"])
-        except MALFORMED as error:
-            raise CheckpointError(f"checkpoint {options.base_checkpoint!r} has other networks: {error}") from error
+        take_over(options.base_checkpoint, base, model, env, options.recipe in OTHER_TERMS)
     return Guide(model.to(training.device), training.distillation)
 
 

@@ -9,7 +9,7 @@ import torch
 
 from cotap.compliance import modulate_stiffness, resolve_joint_stiffness
 from cotap.compliance.laws import LawConfig
-from cotap.configs import BASE_RECIPES, DISTILL_RECIPES, BaseTraining
+from cotap.configs import BASE_RECIPES, DISTILL_RECIPES
 from cotap.envs.observations import ObservationConfig
 from cotap.envs.upper_body import LawSampling, UpperBodyConfig
 
@@ -92,17 +92,17 @@ def test_the_threshold_of_the_ratio_is_the_laws_own(make_env):
         LawConfig("cotap", condition_threshold=0.5).check()
 
 
-@pytest.mark.parametrize("recipe", ["torque-critic", "goals"])
-def test_recipes_of_other_observations_want_a_base_of_their_own(recipe):
-    with pytest.raises(ValueError, match=f"base --recipe {recipe}"):
-        DISTILL_RECIPES[recipe](BaseTraining())
-    training = DISTILL_RECIPES[recipe](BASE_RECIPES[recipe]())
-    training.check()
-    assert training.env.observations == BASE_RECIPES[recipe]().env.observations
+def test_ablations_differ_from_the_default_in_one_thing():
+    base = BASE_RECIPES["default"]()
+    expected = DISTILL_RECIPES["default"](base)
+    expected.env.observations.arm_torque = "critic"
+    assert DISTILL_RECIPES["torque-critic"](base) == expected
+    expected = DISTILL_RECIPES["default"](base)
+    expected.env.observations.goals = True
+    assert DISTILL_RECIPES["goals"](base) == expected
 
 
 def test_the_ratio_is_switched_off_by_its_recipe_alone():
     base = BASE_RECIPES["default"]()
-    off = {name: not make(base).env.upper_body.singularity_ratio for name, make in DISTILL_RECIPES.items()
-           if name in ("default", "paper", "no-ratio")}  # fmt: skip
-    assert off == {"default": False, "paper": False, "no-ratio": True}
+    off = [name for name, make in DISTILL_RECIPES.items() if not make(base).env.upper_body.singularity_ratio]
+    assert off == ["no-ratio"]

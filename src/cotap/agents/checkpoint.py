@@ -117,9 +117,9 @@ def load_checkpoint(path: Path | str, device: str = "cpu") -> dict[str, Any]:
     except Exception as error:  # on rubbish, torch's restricted unpickler raises whatever its reading stumbles over
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise CheckpointError(f"checkpoint {str(path)!r} cannot be read (truncated or foreign): {reason}") from error
-    if not isinstance(content, dict) or not _same(content.get("format"), FORMAT):
+    if not isinstance(content, dict) or not same(content.get("format"), FORMAT):
         raise CheckpointError(f"{str(path)!r} is not a cotap checkpoint")
-    if not _same(content.get("version"), VERSION):
+    if not same(content.get("version"), VERSION):
         raise CheckpointError(f"{str(path)!r} has version {content.get('version')!r}; this cotap reads {VERSION}")
     return content
 
@@ -145,13 +145,13 @@ def require_parts(path: Path | str, content: dict[str, Any], parts: Collection[s
 def require_layout(path: Path | str, saved: dict[str, Any], present: dict[str, Any]) -> None:
     """Raise CheckpointError naming the first entry in which a checkpoint's layout differs from the environment's."""
     for key, value in present.items():
-        if not _same(saved.get(key), value):
+        if not same(saved.get(key), value):
             raise CheckpointError(
                 f"checkpoint {str(path)!r} was trained with another {key}: {saved.get(key)!r}, here {value!r}"
             )
 
 
-def _same(saved: Any, expected: Any) -> bool:
+def same(saved: Any, expected: Any) -> bool:
     """Whether plain data are equal; a file may hold tensors in their place, whose comparison is no truth value."""
     try:
         return type(saved) is type(expected) and bool(saved == expected)

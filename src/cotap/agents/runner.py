@@ -24,7 +24,6 @@ from cotap.agents.checkpoint import (
     CheckpointError,
     load_checkpoint,
     remove_leftovers,
-    require_layout,
     require_parts,
     save_checkpoint,
     write_json,
@@ -32,6 +31,7 @@ from cotap.agents.checkpoint import (
 from cotap.agents.distillation import Guide
 from cotap.agents.dual_ppo import DualPPO, DualPPOConfig
 from cotap.agents.ranks import Ranks
+from cotap.agents.refit import take_over
 from cotap.agents.run_log import RunLog, Unfailing, say
 from cotap.agents.runner_config import RunnerConfig
 
@@ -245,8 +245,16 @@ class DualRunner(OnPolicyRunner):
                 _shed_simulator_states(max(older))
         self._saved = self.current_learning_iteration
 
-    def load(self, path: str, *_: Any, map_location: str | None = None, **__: Any) -> dict:
+    def load(
+        self, path: str, *_: Any, map_location: str | None = None, other_terms: bool = False, **__: Any
+    ) -> dict:  # fmt: skip
         """Load a checkpoint. What it lacks (a shipped one has no optimiser or simulator states) starts afresh.
+
+        Args:
+            path: The file.
+            map_location: Where to load it to; by default where the networks live.
+            other_terms: Whether it may have been trained with other terms in its observation. Its networks are then
+                refitted to these, and all else starts afresh.
 
         Raises:
             CheckpointError: the file cannot be used, or was trained for another robot or observation layout.
@@ -254,11 +262,8 @@ class DualRunner(OnPolicyRunner):
         content = load_checkpoint(path, map_location or self.device)
         require_parts(path, content, PARTS.keys() - {"agents", "kind"})
         env: Any = self.env
-        require_layout(path, content["layout"], json.loads(json.dumps(env.layout())))
-        try:
-            self.alg.model.load_state_dict(content["model"])
-        except MALFORMED as error:
-            raise CheckpointError(f"checkpoint {path!r} has other networks: {error}") from error
+        if take_over(path, content, self.alg.model, env, other_terms):
+            content.update(learner={}, env={})
         fresh: list[str] = []
         try:
             if content["learner"]:

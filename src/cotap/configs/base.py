@@ -77,21 +77,6 @@ def robust(training: BaseTraining | None = None) -> BaseTraining:
     return training
 
 
-def torque_critic() -> BaseTraining:
-    """Ablation: the arms' torque is seen by the critics only (paper, appendix C)."""
-    training = default()
-    training.env.observations.arm_torque = "critic"
-    return training
-
-
-def goals() -> BaseTraining:
-    """Ablation: actors see the arms' commanded stiffness and alpha, which vary although PD does not heed them yet."""
-    training = default()
-    training.env.observations.goals = True
-    training.env.upper_body.sampling.enabled = True
-    return training
-
-
 def facet() -> BaseTraining:
     """FACET as the paper trains it: PD arms, its tracking reward on the data's own motion, no moving reference."""
     training = default()
@@ -110,8 +95,6 @@ BASE_RECIPES: dict[str, Callable[[], BaseTraining]] = {
     "default": default,
     "paper": paper,
     "robust": robust,
-    "torque-critic": torque_critic,
-    "goals": goals,
     "facet": facet,
 }
 """Stage 1, by name."""

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 
 from cotap.agents.distillation import DistillationConfig
 from cotap.configs.base import BaseTraining, reward_as_facet
-from cotap.envs.commands import STEP_APART_M, STEP_CLEAR_M
 
 
 @dataclass
@@ -33,7 +32,7 @@ def default(base: BaseTraining) -> DistillTraining:
     env.commands.step_timing = True
     # Legs that may pass through each other learn to, and trip over each other anywhere else.
     env.collision = "full"
-    env.commands.step_apart_m, env.commands.step_clear_m = STEP_APART_M, STEP_CLEAR_M
+    env.commands.step_apart_m, env.commands.step_clear_m = 0.04, 0.15
     for law in (env.upper_body.left, env.upper_body.right):
         law.name, law.damping = "cotap", "critical"
     env.upper_body.sampling.enabled = True
@@ -66,29 +65,38 @@ def paper(base: BaseTraining) -> DistillTraining:
 
 def no_ratio(base: BaseTraining) -> DistillTraining:
     """Ablation: compliance does not give way to PD near singular arms (paper, Table IV)."""
-    training = default(base)
+    return without_ratio(default(base))
+
+
+def torque_critic(base: BaseTraining) -> DistillTraining:
+    """Ablation: the arms' torque is seen by the critics only (paper, appendix C)."""
+    return with_torque_for_critics(default(base))
+
+
+def goals(base: BaseTraining) -> DistillTraining:
+    """Ablation: actors see stiffness and alpha as commanded."""
+    return with_goals(default(base))
+
+
+def without_ratio(training: DistillTraining) -> DistillTraining:
+    """`training` without the singularity-aware ratio."""
+    training = copy.deepcopy(training)
     training.env.upper_body.singularity_ratio = False
     return training
 
 
-def torque_critic(base: BaseTraining) -> DistillTraining:
-    """Ablation: the arms' torque is seen by the critics only. Raises ValueError for a base that was not trained so."""
-    _require_base("torque-critic", base.env.observations.arm_torque == "critic")
-    return default(base)
+def with_torque_for_critics(training: DistillTraining) -> DistillTraining:
+    """`training` with the arms' torque moved from the actors' observation to the critics'."""
+    training = copy.deepcopy(training)
+    training.env.observations.arm_torque = "critic"
+    return training
 
 
-def goals(base: BaseTraining) -> DistillTraining:
-    """Ablation: actors see stiffness and alpha as commanded. Raises ValueError for a base that was not trained so."""
-    _require_base("goals", base.env.observations.goals)
-    return default(base)
-
-
-def _require_base(recipe: str, fits: bool) -> None:
-    if not fits:
-        raise ValueError(
-            f"recipe {recipe!r} changes the observation: it needs --base-checkpoint with a base of the same recipe "
-            f"(python -m cotap.train base --recipe {recipe})"
-        )
+def with_goals(training: DistillTraining) -> DistillTraining:
+    """`training` with stiffness and alpha, as commanded, in the actors' observation."""
+    training = copy.deepcopy(training)
+    training.env.observations.goals = True
+    return training
 
 
 def facet(base: BaseTraining) -> DistillTraining:
@@ -109,3 +117,11 @@ DISTILL_RECIPES: dict[str, Callable[[BaseTraining], DistillTraining]] = {
     "facet": facet,
 }
 """Stage 2, by name."""
+DISTILL_CONTINUATIONS: dict[str, Callable[[DistillTraining], DistillTraining]] = {
+    "no-ratio": without_ratio,
+    "torque-critic": with_torque_for_critics,
+    "goals": with_goals,
+}
+"""Recipes that may also go on from a checkpoint of stage 2, and then change its config."""
+OTHER_TERMS = ("torque-critic", "goals")
+"""Recipes that change what networks see, and so refit those of the checkpoint that they begin from."""

@@ -16,10 +16,6 @@ STEADY_RAD = 0.2
 TURNED_RAD_S = 1.0
 """Yaw rate from which a robot counts as turned by a blow [rad/s]; balance is lost at less, and then says nothing."""
 
-STEP_APART_M, STEP_CLEAR_M = 0.04, 0.15
-"""How much further apart feet are put, and how close they may come, from distillation on [m]. In training they pass
-through each other, and they do."""
-
 HURRY = 1.3
 """How much faster the gait clock of a robot runs that catches itself."""
 

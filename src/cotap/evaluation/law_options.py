@@ -20,19 +20,19 @@ class LawOptions:
     """Hand stiffness, one number or X Y Z, heading frame [N/m]."""
     null_stiffness: float = 25.0
     """Stiffness of arm motion that leaves the hand where it is [Nm/rad]."""
-    alpha: float = 1.0
+    alpha: float = LawConfig.alpha
     """Share of compliance in its blend with PD (cotap, hmc)."""
-    error: str = "joint"
+    error: str = LawConfig.error
     """What stiffness acts on: joint or task error."""
-    damping: str = "critical"
+    damping: str = LawConfig.damping
     """pd or critical."""
-    virtual_mass: float = 1.0
+    virtual_mass: float = LawConfig.virtual_mass
     """Mass of the hand's model [kg] (facet, hmc)."""
-    damping_ratio: float = 1.0
+    damping_ratio: float = LawConfig.damping_ratio
     """Damping of the hand's model, as a share of critical (facet, hmc)."""
-    sensing: str = "privileged"
+    sensing: str = LawConfig.sensing
     """Force on the hand: privileged or estimated, from arm torques (facet, dcc)."""
-    reference_share: float = 0.5
+    reference_share: float = LawConfig.reference_share
     """Share of the compliance that the moving reference provides (cotap+facet-matched)."""
     torso_compliance: str = "none"
     """What is put down to the torso: none, constant or support."""

@@ -213,7 +213,7 @@ def play_config(env: H1EnvConfig) -> H1EnvConfig:
     env.impedance.share, env.commands.steady_rad = 0.0, STEADY_RAD
     env.upper_body.sampling.enabled = False  # what the page sets stays
     env.motions.clips.share, env.motions.clips.only, env.motions.clips.held_out = 1.0, (), ()
-    for weights in (env.rewards.lower, env.rewards.upper):  # nobody learns here
+    for weights in (env.rewards.lower, env.rewards.upper):  # nobody learns here; a group must have one term
         for term in fields(weights):
             if term.name != "alive":
                 setattr(weights, term.name, 0.0)

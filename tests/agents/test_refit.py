@@ -1,0 +1,151 @@
+"""Refitted networks act as those they come from, and see what is new only once they have learned to."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from typing import Any, cast
+
+import pytest
+import torch
+from rsl_rl.modules import EmpiricalNormalization
+
+from cotap.agents.actors import DualActorCritic, Observations, as_dict
+from cotap.agents.checkpoint import CheckpointError
+from cotap.agents.refit import columns, take_over
+from cotap.agents.runner import layout_of
+from cotap.envs import H1Env
+from cotap.envs.observations import NoiseConfig, ObservationConfig
+
+HISTORY, TORQUES, GOALS = 5, 8, 10
+MakeEnv = Callable[..., H1Env]
+
+
+def observations(env: H1Env, seed: int) -> Observations:
+    rng = torch.Generator().manual_seed(seed)
+    return {k: 1.0 + torch.randn(v.shape, generator=rng) for k, v in as_dict(env.get_observations()).items()}
+
+
+def trained(env: H1Env, symmetric: bool) -> DualActorCritic:
+    """Networks with weights and statistics of their own."""
+    torch.manual_seed(3)
+    model = DualActorCritic(layout_of(env, symmetric), (16, 8), 0.4)
+    for parameter in model.parameters():
+        torch.nn.init.normal_(parameter, 0.1, 0.3)
+    model.update_normalizers(observations(env, 1))
+    return model.eval()
+
+
+def content(env: H1Env, model: DualActorCritic) -> dict[str, Any]:
+    return {"layout": json.loads(json.dumps(env.layout())), "model": model.state_dict()}
+
+
+def mean(model: DualActorCritic) -> torch.Tensor:
+    """What actors' observations are normalised by."""
+    return cast(EmpiricalNormalization, model.normalizers["policy"]).mean
+
+
+def fresh(env: H1Env, symmetric: bool) -> DualActorCritic:
+    torch.manual_seed(4)
+    return DualActorCritic(layout_of(env, symmetric), (16, 8), 1.0)
+
+
+def values(model: DualActorCritic, x: Observations) -> torch.Tensor:
+    read = model.read("critic", model.normalize(x))
+    return torch.cat([critic(read) for critic in model.critics.values()], 1)
+
+
+@pytest.mark.parametrize("symmetric", [True, False])
+@pytest.mark.parametrize("noise", [False, True])
+def test_what_is_new_is_ignored_at_first(make_env: MakeEnv, symmetric: bool, noise: bool):
+    noisy = NoiseConfig(enabled=noise)
+    before = make_env(observations=ObservationConfig(noise=noisy))
+    now = make_env(observations=ObservationConfig(goals=True, noise=noisy))
+    old, new = trained(before, symmetric), fresh(now, symmetric)
+    assert take_over("c.pt", content(before, old), new, now, other_terms=True)
+    x = observations(now, 2)
+    without = {k: v if k == "privileged" else v[:, : -HISTORY * GOALS] for k, v in x.items()}
+    torch.testing.assert_close(new.eval()(x), old(without))
+    torch.testing.assert_close(values(new, x), values(old, without))
+    assert float(old(without).detach().std()) > 0.1
+    for name in old.log_std:
+        assert torch.equal(new.log_std[name], old.log_std[name])
+
+
+@pytest.mark.parametrize("symmetric", [True, False])
+def test_what_has_gone_counts_as_at_its_mean(make_env: MakeEnv, symmetric: bool):
+    before = make_env()
+    now = make_env(observations=ObservationConfig(arm_torque="critic"))
+    old, new = trained(before, symmetric), fresh(now, symmetric)
+    take_over("c.pt", content(before, old), new, now, other_terms=True)
+    x = observations(before, 2)
+    blind = x["policy"].clone()
+    blind[:, -HISTORY * TORQUES :] = mean(old)[-HISTORY * TORQUES :]
+    expected = old({"policy": blind})
+    without = {"policy": x["policy"][:, : -HISTORY * TORQUES]}
+    torch.testing.assert_close(new.eval()(without), expected)
+    assert (expected - old(x)).abs().max() > 0.1
+
+
+def test_critics_keep_the_weights_of_what_they_alone_still_see(make_env: MakeEnv):
+    before, now = make_env(), make_env(observations=ObservationConfig(arm_torque="critic"))
+    old, new = trained(before, True), fresh(now, True)
+    take_over("c.pt", content(before, old), new, now, other_terms=True)
+    seen = before.get_observations()["policy"].shape[1]
+    kept = seen - HISTORY * TORQUES
+    was, has = (m.state_dict()["critics.upper.weights.0"] for m in (old, new))
+    newest = was[:, kept:seen].reshape(-1, HISTORY, TORQUES)[:, -1]
+    # Orientation and velocity come before the torques.
+    assert torch.equal(has, torch.cat((was[:, :kept], was[:, seen : seen + 7], newest, was[:, seen + 7 :]), 1))
+
+
+def test_statistics_of_what_is_new_are_those_of_the_worlds(make_env: MakeEnv):
+    before, now = make_env(), make_env(64, observations=ObservationConfig(goals=True))
+    new = fresh(now, True)
+    take_over("c.pt", content(before, trained(before, True)), new, now, other_terms=True)
+    goals = now.get_observations()["policy"][:, -GOALS:]
+    both = torch.cat((goals, goals[:, [5, 6, 7, 8, 9, 0, 1, 2, 3, 4]]))
+    torch.testing.assert_close(mean(new)[-GOALS:], both.mean(0), atol=1e-4, rtol=1e-4)
+
+
+def test_columns_run_term_by_term_and_oldest_first():
+    layout = {"terms": [["a", 2, 1.0], ["b", 1, 3.0]], "critic_terms": [["c", 2, 1.0]], "history": 2}
+    assert columns(layout) == {
+        "policy": [("a", 2), ("a", 3), ("a", 0), ("a", 1), ("b", 1), ("b", 0)],
+        "clean": [("a", 2), ("a", 3), ("a", 0), ("a", 1), ("b", 1), ("b", 0)],
+        "privileged": [("c", 0), ("c", 1)],
+    }
+
+
+def test_nothing_is_refitted_where_nothing_differs(make_env: MakeEnv):
+    env = make_env()
+    old, new = trained(env, True), fresh(env, True)
+    assert not take_over("c.pt", content(env, old), new, env, other_terms=True)
+    assert all(torch.equal(v, old.state_dict()[k]) for k, v in new.state_dict().items())
+
+
+@pytest.mark.parametrize(
+    ("saved", "other_terms", "needle"),
+    [
+        ({}, False, "another terms"),
+        ({"robot": "g1"}, True, "another robot: 'g1', here 'h1'"),
+        ({"history": 3}, True, "another history: 3, here 5"),
+        ({"terms": [["a"]]}, True, "other networks"),
+        ({"terms": torch.ones(3)}, True, "other networks"),
+        ({"critic_terms": None}, True, "other networks"),
+    ],
+)
+def test_what_cannot_be_refitted_is_refused(make_env: MakeEnv, saved: dict[str, Any], other_terms: bool, needle: str):
+    before, now = make_env(), make_env(observations=ObservationConfig(goals=True))
+    given = content(before, trained(before, True))
+    given["layout"] |= saved
+    new = fresh(now, True)
+    with pytest.raises(CheckpointError, match=needle):
+        take_over("c.pt", given, new, now, other_terms)
+
+
+def test_networks_of_another_width_are_refused(make_env: MakeEnv):
+    before, now = make_env(), make_env(observations=ObservationConfig(goals=True))
+    wide = DualActorCritic(layout_of(now), (32, 8), 1.0)
+    with pytest.raises(CheckpointError, match="other networks"):
+        take_over("c.pt", content(before, trained(before, True)), wide, now, other_terms=True)
