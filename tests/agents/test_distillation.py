@@ -85,6 +85,17 @@ def test_guidance_draws_the_guided_agent_to_the_base_and_leaves_the_other():
         assert torch.equal(value, parameters(free, "upper")[key]), key
 
 
+def test_a_base_that_has_no_say_any_more_costs_nothing(monkeypatch: pytest.MonkeyPatch):
+    learner = guided(base_policy(), DistillationConfig(end_iterations=1))
+    collect(learner)
+    assert "lower/base_kl" in learner.update()
+    monkeypatch.setattr(learner.guide, "mean_action", lambda _: pytest.fail("the base was asked"))
+    collect(learner)
+    log = learner.update()
+    assert log["lower/base_beta"] == 0.0
+    assert "lower/base_kl" not in log
+
+
 def test_the_base_is_never_changed_and_a_change_is_noticed():
     base = base_policy()
     original = copy.deepcopy(base.state_dict())

@@ -186,7 +186,7 @@ class DualPPO:
         std = torch.cat([model.log_std[n].exp() for n in self.names])
         actions = mean + std * torch.randn_like(mean)
         r.means[t], r.actions[t] = mean, actions
-        if self.guide and r.guide_means is not None:
+        if self.guide and self.guide.beta(self.iterations) > 0.0 and r.guide_means is not None:
             r.guide_means[t] = self.guide.mean_action(observations)
         for g, name in enumerate(self.names):
             part = self.layout.action_slices[name]
@@ -279,9 +279,10 @@ class DualPPO:
         entropy = gaussian_entropy(log_std)
         loss = surrogate + cfg.value * value_loss - cfg.entropy * entropy
         stats = {"surrogate": surrogate.detach(), "value": value_loss.detach(), "entropy": entropy.detach(), "kl": kl}
-        if self.guide and name in self.guide.cfg.agents:
+        beta = self.guide.beta(self.iterations) if self.guide and name in self.guide.cfg.agents else 0.0
+        if self.guide and beta > 0.0:
             distance = self.guide.kl(name, mean, log_std, batch["guide_means"][:, part])
-            penalty = self.guide.beta(self.iterations) * distance
+            penalty = beta * distance
             loss = loss + penalty
             share = penalty / (penalty + surrogate.abs() + cfg.entropy * entropy.abs() + 1e-12)
             stats |= {"base_kl": distance.detach(), "base_share": share.detach()}

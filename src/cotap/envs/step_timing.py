@@ -52,7 +52,7 @@ class FallRisk(nn.Module):
 
 HURRY_S = 0.8
 """For how long a robot that catches itself steps faster [s]."""
-REST_S = 0.4
+REST_S = 0.25
 """Time between two jumps of the clock [s]: a step must be taken before it can be judged."""
 GAIN = 0.25
 """By how much a jump must lower the chance of a fall."""
