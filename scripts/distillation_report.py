@@ -55,36 +55,41 @@ def no_worse(mine: dict[str, Any], base: dict[str, Any]) -> bool:
 
 
 def walking(runs: Runs, envs: int, seconds: float) -> list[str]:
-    """The walk under every stiffness and blend, beside the base's."""
+    """The walk under every stiffness and blend, beside the base's: in the same simulation, and in that it was trained
+    in."""
     task = ["velocity-tracking", "--num-envs", str(envs), "--episode-seconds", str(seconds)]
-    base = runs("walking-base", *task, checkpoint="base")
+    base = runs("walking-base", *task, "--collision", "full", checkpoint="base")
+    trained = runs("walking-base-as-trained", *task, checkpoint="base")
     lines = [
         "## Walking", "",
-        f"Random commands, clips on the arms, randomisation on, {envs} worlds, {seconds:g} s. In bold: worse than the "
-        "base by more than 10 % and beyond its 95 % interval.", "",
+        f"Random commands, clips on the arms, randomisation on, {envs} worlds, {seconds:g} s, legs, arms and torso "
+        "that collide. The base was trained with feet that pass through each other, which is its second row. In bold: "
+        "worse than the base in the same simulation by more than 10 % and beyond its 95 % interval.", "",
         "| K_ee [N/m] | alpha | " + " | ".join(WALKING.values()) + " | fell |",
         "|---" * (3 + len(WALKING)) + "|",
-        "| base, PD | | " + " | ".join(number(base["metrics"][k]) for k in WALKING)
-        + f" | {base['num_falls']} of {envs} |",
     ]  # fmt: skip
-    kept = total = 0
+    for name, result in (("base, PD", base), ("base, PD, feet and floor alone collide", trained)):
+        cells = [number(result["metrics"][key]) for key in WALKING]
+        lines.append(f"| {name} | | " + " | ".join(cells) + f" | {result['num_falls']} of {envs} |")
+    kept = kept_as_trained = total = 0
     for stiffness in STIFFNESS:
         for alpha in ALPHA:
             law = ["--method", "cotap", "--stiffness", str(stiffness), "--alpha", str(alpha)]
-            result = runs(f"walking-{stiffness}-{alpha}", *task, *law)
+            result = runs(f"walking-{stiffness}-{alpha}", *task, "--collision", "full", *law)
             cells = []
-            for key in WALKING:
-                mine, reference = result["metrics"][key], base["metrics"][key]
-                good = no_worse(mine, reference)
+            for key in (*WALKING, "fall_fraction"):
+                mine = result["metrics"][key]
+                good = no_worse(mine, base["metrics"][key])
                 kept, total = kept + good, total + 1
-                cells.append(f"{mine['mean']:.3f}" if good else f"**{mine['mean']:.3f}**")
-            fell = result["metrics"]["fall_fraction"]
-            good = no_worse(fell, base["metrics"]["fall_fraction"])
-            kept, total = kept + good, total + 1
-            falls = f"{result['num_falls']} of {envs}"
-            cells.append(falls if good else f"**{falls}**")
+                kept_as_trained += no_worse(mine, trained["metrics"][key])
+                text = f"{mine['mean']:.3f}" if key in WALKING else f"{result['num_falls']} of {envs}"
+                cells.append(text if good else f"**{text}**")
             lines.append(f"| {stiffness} | {alpha:g} | " + " | ".join(cells) + " |")
-    return [*lines, "", f"{kept} of {total} figures are no worse than the base's.", ""]
+    return [
+        *lines, "",
+        f"{kept} of {total} figures are no worse than the base's in the same simulation, {kept_as_trained} no worse "
+        "than where its feet pass through each other.", "",
+    ]  # fmt: skip
 
 
 def obedience(runs: Runs, envs: int) -> list[str]:

@@ -232,6 +232,14 @@ def plot_curves(path: Path, curves: dict[str, tuple[list[float], list[float]]], 
     save_figure(figure, path)
 
 
+def samples(checkpoint: str) -> int:
+    """What a shipped policy was trained on; 0 for one that is not shipped."""
+    from cotap.evaluation.policy import checkpoint_path
+
+    path = checkpoint_path(checkpoint).with_suffix(".json")
+    return json.loads(path.read_text())["samples"] if path.is_file() else 0
+
+
 def ablations(book: Book, motion: str) -> None:
     """The ablation table, at K 100 in stance."""
     book.add(
@@ -262,7 +270,13 @@ def ablations(book: Book, motion: str) -> None:
             f"| {name} | {number(m['e_torso'])} | {number(m['e_upper'])} "
             f"| {number(result['metrics']['fall_fraction'], 2)} | {printed} |"
         )
-    book.add("")
+    trained = [(name, samples(name)) for name in ("cotap", "cotap-no-ratio", "cotap-torque-critic", "cotap-goals")]
+    book.add(
+        "",
+        "One seed each. The three that were trained under their change went on from a policy of CoTaP's own run. "
+        "Samples behind each: " + ", ".join(f"`{name}` {n / 1e6:.1f} M" for name, n in trained if n) + ".",
+        "",
+    )
     ordering(
         book, "e_upper of CoTaP below that without the ratio", "ablation-CoTaP", "ablation-without-the-ratio", "e_upper"
     )
