@@ -55,8 +55,8 @@ def no_worse(mine: dict[str, Any], base: dict[str, Any]) -> bool:
 
 
 def walking(runs: Runs, envs: int, seconds: float) -> list[str]:
-    """The walk under every stiffness and blend, beside the base's: in the same simulation, and in that it was trained
-    in."""
+    """The walk under every stiffness and blend, beside the base's in the same simulation and in the one of its
+    training."""
     task = ["velocity-tracking", "--num-envs", str(envs), "--episode-seconds", str(seconds)]
     base = runs("walking-base", *task, "--collision", "full", checkpoint="base")
     trained = runs("walking-base-as-trained", *task, checkpoint="base")

@@ -328,7 +328,7 @@ def torque_observation(book: Book) -> None:
     """Velocity error with and without arm torque in the actor's observation."""
     book.add(
         "",
-        "## Arm torque in the observation (the paper's Fig. 9)",
+        "## Arm torque in the observation (the paper's Fig. 8)",
         "",
         "Walking at 0.5 m/s without disturbance, arms at K_ee 300 following the training mixture.",
         "",
