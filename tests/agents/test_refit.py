@@ -99,6 +99,23 @@ def test_critics_keep_the_weights_of_what_they_alone_still_see(make_env: MakeEnv
     assert torch.equal(has, torch.cat((was[:, :kept], was[:, seen : seen + 7], newest, was[:, seen + 7 :]), 1))
 
 
+@pytest.mark.parametrize("noise", [False, True])
+def test_critics_keep_the_statistics_of_what_they_alone_still_see(make_env: MakeEnv, noise: bool):
+    """Else weights that were learned on numbers of the order of one would meet others."""
+    noisy = NoiseConfig(enabled=noise)
+    before = make_env(observations=ObservationConfig(noise=noisy))
+    now = make_env(observations=ObservationConfig(arm_torque="critic", noise=noisy))
+    old, new = trained(before, True), fresh(now, True)
+    take_over("c.pt", content(before, old), new, now, other_terms=True)
+    was, has = old.state_dict(), new.state_dict()
+    for key in ("_mean", "_std", "_var"):
+        mine = has[f"normalizers.privileged.{key}"][:, 7 : 7 + TORQUES]
+        source = "clean" if noise else "policy"
+        assert torch.equal(mine, was[f"normalizers.{source}.{key}"][:, -TORQUES:])
+        rest = has[f"normalizers.privileged.{key}"][:, [*range(7), *range(7 + TORQUES, 7 + TORQUES + 6)]]
+        assert torch.equal(rest, was[f"normalizers.privileged.{key}"])
+
+
 def test_statistics_of_what_is_new_are_those_of_the_worlds(make_env: MakeEnv):
     before, now = make_env(), make_env(64, observations=ObservationConfig(goals=True))
     new = fresh(now, True)

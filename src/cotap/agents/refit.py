@@ -57,8 +57,8 @@ def refit(
     """The state that `fresh` is to have to act as `model` did.
 
     Columns keep their weights and statistics. A term that has gone counts as being at its mean. A new one has weights
-    of zero and the statistics that `fresh` has for it; a critic takes over the weights of a term that its actor
-    saw until now.
+    of zero and the statistics that `fresh` has for it. A critic takes over weights and statistics of a term that its
+    actor saw until now.
 
     Args:
         model: State of the networks that were trained.
@@ -68,23 +68,18 @@ def refit(
     """
     before, now = columns(saved), columns(present)
     state = {name: value.clone() for name, value in fresh.state_dict().items()}
-    for name, value in model.items():
+    for name, value in state.items():
         part, which, *_ = name.split(".")
-        if part == "normalizers":
-            old, new = _common(before[which], now[which])
-            axis = value.dim() - 1
+        if part == "normalizers" and value.dim():
+            # A term that a critic sees from now on comes from what its actor saw; its own columns have the last word.
+            for group in sorted(before, key=lambda group: group == which):
+                if (old := model.get(name.replace(which, group, 1))) is not None:
+                    _take(value, old, before[group], now[which])
         elif name.endswith(FIRST_LAYER):
             groups = fresh.layout.obs_groups["actor" if part == "actors" else "critic"]
-            old, new = _common(_joined(before, groups), _joined(now, groups))
-            axis = 1
-            state[name].zero_()
+            _take(value.zero_(), model[name], _joined(before, groups), _joined(now, groups))
         else:
-            state[name].copy_(value)
-            continue
-        if value.dim() == 0:  # how many samples the statistics are of
-            state[name].copy_(value)
-        else:
-            state[name].index_copy_(axis, torch.tensor(new), value.index_select(axis, torch.tensor(old)))
+            value.copy_(model[name])
     return state
 
 
@@ -92,8 +87,15 @@ def _joined(places: Columns, groups: list[str]) -> list[tuple[str, int]]:
     return [place for group in groups for place in places[group]]
 
 
-def _common(before: list[tuple[str, int]], now: list[tuple[str, int]]) -> tuple[list[int], list[int]]:
-    """Where the columns that both have are in either."""
+def _take(
+    value: torch.Tensor, old: torch.Tensor, before: list[tuple[str, int]], now: list[tuple[str, int]]
+) -> None:  # fmt: skip
+    """Copy the columns, `now` and `before`, that both have. Raises ValueError if there are not as many as there are
+    places."""
+    if (value.shape[-1], old.shape[-1]) != (len(now), len(before)):
+        raise ValueError(f"{old.shape[-1]} columns for {len(before)} places")
     where = {place: i for i, place in enumerate(before)}
     both = [(where[place], i) for i, place in enumerate(now) if place in where]
-    return [i for i, _ in both], [i for _, i in both]
+    mine, others = torch.tensor([i for _, i in both]), torch.tensor([i for i, _ in both])
+    if both:
+        value.index_copy_(-1, mine, old.index_select(-1, others))
