@@ -220,6 +220,23 @@ def test_a_short_trial_is_padded_as_fallen(policy, spec):
     assert t.alive().tolist() == [[True, k < 4] for k in range(10)]
 
 
+def test_a_trial_that_diverged_is_padded_as_fallen(policy, spec):
+    robot, controller = make_robot(spec), make_controller(policy, spec)
+    trial = run_trial(robot, controller, Scenario(0.1, command=(TimedCommand(stand=True),)), SafetyConfig(ramp_s=0.0))
+    trial.fell = True  # in a step of which there is no row
+    assert trajectory([trial], 10).alive()[:, 0].tolist() == [k < 5 for k in range(10)]
+
+
+def test_random_directions_are_drawn_from_the_trials_seed(spec):
+    profile = ForceProfile((50.0, 0.0, -5.0), "left", 0.0, random_direction=True)
+    drawn = [Scenario(1.0, force=(profile,)).forces(spec, 0.02, seed)[0].amplitude_h[0, 0] for seed in (1, 1, 2)]
+    assert torch.equal(drawn[0], drawn[1])
+    assert not torch.equal(drawn[0], drawn[2])
+    for force in drawn:
+        assert float(force[:2].norm()) == pytest.approx(50.0, rel=1e-5)
+        assert float(force[2]) == -5.0
+
+
 SCENARIO = """
 seconds = 1.0
 left = "cotap:alpha=0.7,stiffness=500"
@@ -333,6 +350,13 @@ def test_the_trained_law_is_the_default(policy):
     laws = law_config(dataclasses.replace(policy.metadata, law=law))
     assert laws.left.name == "pd"
     assert (laws.right.name, laws.right.stiffness) == ("cotap", (200.0, 300.0, 400.0))
+    assert laws.singularity_ratio
+    assert laws.torso == UpperBodyConfig().torso
+    other = law | {"singularity_ratio": False, "torso": law["torso"] | {"model": "constant"}}
+    laws = law_config(dataclasses.replace(policy.metadata, law=other))
+    assert (laws.singularity_ratio, laws.torso.model) == (False, "constant")
+    earlier = {name: law[name] for name in ("left", "right", "ranges")}
+    assert law_config(dataclasses.replace(policy.metadata, law=earlier)).singularity_ratio
     with pytest.raises(PolicyError, match="h2"):
         robot_of(dataclasses.replace(policy.metadata, robot="h2"))
 

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import math
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -18,10 +21,12 @@ from cotap.deployment.engines import EngineConfig
 from cotap.deployment.robot import Perturbations
 from cotap.deployment.safety import SafetyConfig
 from cotap.deployment.scenario import Scenario
-from cotap.deployment.sim_to_sim import Comparison, falls, statics, swing
+from cotap.deployment.sim_to_sim import Comparison, falls, loads, periodic, statics
 from cotap.deployment.trial import Trial
 from cotap.deployment.workers import Workers
 from cotap.envs.upper_body import UpperBodyConfig
+from cotap.evaluation.disturbance import ConstantLoad
+from cotap.robots import RobotSpec
 
 SCRIPT = Path(__file__).parents[2] / "scripts" / "sim_to_sim.py"
 
@@ -41,10 +46,53 @@ def test_rates_of_falls_have_wilsons_interval():
     assert falls([Trial(0.02) for _ in range(20)])["ci95"] == pytest.approx([0.0, 0.1611], abs=1e-4)
 
 
-def test_swings_are_found_beside_drift_and_offset():
-    time = 0.02 * np.arange(400)
-    values = 3.0 + 0.1 * time + 0.7 * np.sin(2.0 * np.pi * time / 4.0 + 1.0)
-    assert swing(values, 0.02, 4.0) == pytest.approx(0.7, rel=1e-6)
+@pytest.mark.parametrize("part", [loads, periodic])
+def test_trials_that_fell_are_in_no_figure_of_the_hand(spec: RobotSpec, part: Callable[..., Any]):
+    """Of two trials one falls, its hands far away: what is told is that of the other; of none, nothing."""
+    protocol = ConstantLoad(onset=3.0)
+    protocol.episode_seconds = 7.0
+
+    def result(*fell: bool) -> dict[str, Any]:
+        def run(*_: Any) -> list[Trial]:
+            return [stand(spec, down) for down in fell]
+
+        if part is loads:
+            return loads(run, spec, protocol, Comparison())["PD"]
+        return periodic(run, spec, Comparison())
+
+    one, two, none = result(False), result(False, True), result(True)
+    if part is loads:
+        assert one["displacement_z"]["mean"] == two["displacement_z"]["mean"] == pytest.approx(-0.05, abs=1e-3)
+        assert one["curve"] == two["curve"]
+        assert none["displacement_z"]["mean"] is None
+        assert none["curve"] == []
+    else:
+        assert one["arms"] == two["arms"]
+        assert one["arms"]["left"]["hand_swing_m"] == pytest.approx(0.05, rel=1e-3)
+        assert none["arms"]["left"]["hand_swing_m"] is None
+    assert two["falls"] == none["falls"] == 1
+
+
+def stand(spec: RobotSpec, falls: bool) -> Trial:
+    """A robot that stands for 15 s, its hands swinging by 5 cm from 3 s on; or falls at 5 s, its hands 1 m off."""
+    trial, arms, joints = Trial(0.02, fell=falls), len(spec.arms), len(spec.upper_joints)
+    pose = np.array([0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0, *(j.default_rad for j in spec.joints)])
+    for k in range(750):
+        down = falls and k >= 250
+        height = -0.05 if k >= 150 and k < 350 else 0.05 * math.sin(2.0 * math.pi * 0.02 * k / 4.0) * (k >= 350)
+        offset = torch.zeros(1, arms, 3, dtype=torch.float64)
+        offset[..., 2] = -1.0 if down else height
+        row = {name: torch.zeros(1) for name in ("height", "height_command", "path_error")}
+        row |= {name: torch.zeros(1, dtype=torch.bool) for name in ("stand", "told_to_stand", "arm_at_limit")}
+        row |= {name: torch.zeros(1, 3) for name in ("velocity", "command")}
+        row |= {
+            name: torch.zeros(1, joints) for name in ("arm_error", "arm_velocity", "arm_torque", "arm_static_torque")
+        }
+        row |= {name: torch.zeros(1, 2) for name in ("position", "foot_speed", "foot_height")}
+        row |= {"foot_contact": torch.ones(1, 2, dtype=torch.bool), "fell": torch.tensor([down])}
+        trial.rows.append(row | {"hand_offset": offset, "hand_error": offset.norm(dim=2)})
+        trial.qpos.append(pose)
+    return trial
 
 
 def test_statics_is_jacobian_transpose_and_compliance(spec, model):
@@ -75,7 +123,7 @@ def test_a_small_comparison_is_written_whole(policy_file, tmp_path, monkeypatch,
     result = json.loads((tmp_path / "report.json").read_text())
     load = result["engines"]["mujoco"]["periodic-load"]["arms"]["right"]
     assert load["elbow_torque_nm"] == pytest.approx(load["elbow_torque_statics_nm"], rel=0.1)
-    assert result["engines"]["mujoco"]["constant-load"]["PD"]["displacement_z"] < -0.03
+    assert result["engines"]["mujoco"]["constant-load"]["PD"]["displacement_z"]["mean"] < -0.03
     assert "| late | 0 of 1" in (tmp_path / "report.md").read_text()
     assert (tmp_path / "report.png").read_bytes().startswith(b"\x89PNG")
     # Again, from what was kept; with another seed, anew.

@@ -72,7 +72,9 @@ def command_config(metadata: PolicyMetadata) -> CommandConfig:
 def law_config(metadata: PolicyMetadata) -> UpperBodyConfig:
     """The laws that the arms were trained under. Raises PolicyError if they cannot be read."""
     try:
-        cfg = from_plain(UpperBodyConfig, {side: metadata.law[side] for side in ("left", "right")})
+        # Files of earlier versions have neither of the last two.
+        known = ("left", "right", "torso", "singularity_ratio")
+        cfg = from_plain(UpperBodyConfig, {name: metadata.law[name] for name in known if name in metadata.law})
         cfg.check()
     except (ValueError, TypeError) as error:
         raise PolicyError(f"the policy's metadata law cannot be used: {error}") from error

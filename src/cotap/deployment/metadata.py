@@ -54,7 +54,8 @@ class PolicyMetadata:
     commands: dict[str, Any]
     """Ranges that commands were drawn from, rates that they change at, the gait's period."""
     law: dict[str, Any]
-    """The arms' laws in training (`left`, `right`) and the `ranges` of their parameters; null where they were fixed."""
+    """The arms' laws in training (`left`, `right`, `torso`, `singularity_ratio`) and the `ranges` of their parameters;
+    null where they were fixed."""
     checkpoint_sha256: str
     cotap_version: str
     opset: int

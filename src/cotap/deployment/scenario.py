@@ -126,9 +126,13 @@ class Scenario:
             for axis, value in enumerate(force.force):
                 require_finite(f"force[{i}].force[{axis}]", value)
 
-    def forces(self, spec: RobotSpec, dt: float) -> list[ScriptedForces]:
-        """The forces, for one robot with this control step [s]."""
-        return [ScriptedForces(force, tuple(arm.side for arm in spec.arms), 1, dt) for force in self.force]
+    def forces(self, spec: RobotSpec, dt: float, seed: int = 0) -> list[ScriptedForces]:
+        """The forces, for one robot with this control step [s]; `seed` draws directions that are random."""
+        rng, one = torch.Generator().manual_seed(seed), torch.ones(1, dtype=torch.bool)
+        forces = [ScriptedForces(force, tuple(arm.side for arm in spec.arms), 1, dt) for force in self.force]
+        for force in forces:
+            force.reset(one, rng)
+        return forces
 
 
 def load_scenario(path: Path | str, spec: RobotSpec) -> Scenario:

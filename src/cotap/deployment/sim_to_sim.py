@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -34,7 +33,9 @@ from cotap.envs.state import StateReader
 from cotap.envs.upper_body import UpperBody, UpperBodyConfig
 from cotap.evaluation.disturbance import ConstantLoad, Impact, window_measures
 from cotap.evaluation.law_options import parse_law
-from cotap.evaluation.metrics import summarize, tracking_measures
+from cotap.evaluation.metrics import summarize, tracking_measures, wilson_interval
+from cotap.evaluation.periodic import amplitude as swing_amplitude
+from cotap.evaluation.periodic import elbow_joints
 from cotap.robots import RobotSpec
 
 STAND = (TimedCommand(stand=True),)
@@ -50,6 +51,8 @@ PERTURBATIONS = {
     "all at once, delay of 1 to 2 steps": Perturbations((1, 2), 0.05, 0.01, 0.5, 0.2, 0.05),
 }
 """Every row of the table of perturbations."""
+SWINGS = ("elbow_torque_nm", "elbow_torque_statics_nm", "hand_swing_m", "hand_swing_statics_m")
+"""Amplitudes under the periodic load, and what statics makes of them; null where no trial stood."""
 LAWS = {
     "PD": "pd", "soft PD": "soft-pd", "K 100": "cotap:stiffness=100", "K 500": "cotap:stiffness=500",
     "K 800": "cotap:stiffness=800", "alpha 0.7, K 500": "cotap:stiffness=500,alpha=0.7",
@@ -158,10 +161,8 @@ def _keep(path: Path | None, about: dict[str, Any], measure: Callable[[], dict[s
 
 def falls(trials: list[Trial]) -> dict[str, Any]:
     """How many fell, with the 95 % interval of the rate (Wilson's)."""
-    n, k, z = len(trials), sum(t.fell for t in trials), 1.96
-    middle = (k + 0.5 * z * z) / (n + z * z)
-    half = z / (n + z * z) * math.sqrt(k * (n - k) / n + 0.25 * z * z)
-    return {"trials": n, "falls": k, "ci95": [max(0.0, middle - half), min(1.0, middle + half)]}
+    n, k = len(trials), sum(t.fell for t in trials)
+    return {"trials": n, "falls": k, "ci95": list(wilson_interval(k / n, n))}
 
 
 def tracking(trials: list[Trial], policy: OnnxPolicy, cfg: Comparison) -> dict[str, Any]:
@@ -185,10 +186,13 @@ def loads(run: Run, spec: RobotSpec, protocol: Impact, cfg: Comparison) -> dict[
         hit = [i for i, arm in enumerate(spec.arms) if protocol.hand in (arm.side, "both")]
         measures = window_measures(t, first, last, hit)
         names = ("e_torso", "e_ee", "e_ee_hit", "j_upper", "e_upper")
+        stood = ~t.fell.any(0)
+        moved = (t.hand_offset[-1] - t.hand_offset[begin - 1])[:, hit, 2].mean(1)
+        curve = t.hand_error[begin - round(0.5 / t.dt) :, stood][:, :, hit].mean((1, 2))
         out[label] = falls(trials) | {
             "metrics": {name: summarize(measures[name], cfg.seed) for name in names},
-            "displacement_z": float((t.hand_offset[-1] - t.hand_offset[begin - 1])[:, 0, 2].mean()),
-            "curve": t.hand_error[begin - round(0.5 / t.dt) :, :, 0].mean(1).tolist(),
+            "displacement_z": summarize(moved[stood], cfg.seed),
+            "curve": curve.tolist() if stood.any() else [],
         }
     return out
 
@@ -198,7 +202,8 @@ def periodic(
 ) -> dict[str, Any]:
     """30 N up and down on both hands, right arm PD, left arm under compliance: swings at that period, and statics'.
 
-    A slow load asks for joint torque `J^T F` whatever the stiffness, and moves the hand by `J K^-1 J^T F`.
+    A slow load asks for joint torque `J^T F` whatever the stiffness, and moves the hand by `J K^-1 J^T F`. Of trials
+    that stood.
     """
     laws = UpperBodyConfig(LawConfig("cotap", (500.0, 500.0, 500.0), 25.0, 0.7), LawConfig("pd"))
     load = ForceProfile((0.0, 0.0, amplitude), "both", ONSET_S, period_s=period)
@@ -206,30 +211,23 @@ def periodic(
     trials = run(Scenario(seconds, command=STAND, force=(load,)), cfg.load_trials, laws)
     t = _trajectory(trials, seconds)
     begin = round((ONSET_S + period) / t.dt)  # the first period is left out
-    hands = t.hand_offset[begin:, :, :, 2].mean(1).double().numpy()
-    elbow = [spec.upper_joints.index(arm.joints[-1]) for arm in spec.arms]
-    torque = t.arm_torque[begin:, :, elbow].mean(1).double().numpy()
-    pose = np.mean([np.mean(trial.qpos[begin:], 0) for trial in trials if len(trial.qpos) > begin] or [[0.0]], 0)
-    out = falls(trials) | {"time": (np.arange(len(torque)) * t.dt).tolist(), "arms": {}}
-    predicted = statics(spec, laws, pose, amplitude) if pose.size > 1 else None
+    stood = ~t.fell.any(0)
+    out = falls(trials) | {"time": [], "arms": {arm.side: dict.fromkeys(SWINGS) for arm in spec.arms}}
+    if not stood.any():
+        return out
+    hands = t.hand_offset[begin:, stood, :, 2].mean(1)
+    torque = t.arm_torque[begin:, stood][:, :, elbow_joints(spec)].mean(1)
+    poses = [np.mean(trial.qpos[begin:], 0) for trial in trials if not trial.fell]
+    predicted = statics(spec, laws, np.mean(poses, 0), amplitude)
+    moments, heights = swing_amplitude(torque, period, t.dt), swing_amplitude(hands, period, t.dt)
+    out["time"] = (np.arange(len(torque)) * t.dt).tolist()
     for i, arm in enumerate(spec.arms):
-        out["arms"][arm.side] = {
-            "elbow_torque_nm": swing(torque[:, i], t.dt, period),
-            "hand_swing_m": swing(hands[:, i], t.dt, period),
-            "elbow_torque_statics_nm": None if predicted is None else predicted[i][0],
-            "hand_swing_statics_m": None if predicted is None else predicted[i][1],
+        swings = (float(moments[i]), predicted[i][0], float(heights[i]), predicted[i][1])
+        out["arms"][arm.side] = dict(zip(SWINGS, swings, strict=True)) | {
             "torque": torque[:, i].tolist(),
             "height": (hands[:, i] - hands[0, i]).tolist(),
         }
     return out
-
-
-def swing(values: np.ndarray, dt: float, period: float) -> float:
-    """Amplitude of the part of `values` (T,) that has this period, by least squares."""
-    angle = 2.0 * math.pi * dt * np.arange(len(values)) / period
-    basis = np.stack((np.sin(angle), np.cos(angle), np.ones_like(angle), angle), 1)
-    s, c = np.linalg.lstsq(basis, values, rcond=None)[0][:2]
-    return float(math.hypot(s, c))
 
 
 def statics(spec: RobotSpec, laws: UpperBodyConfig, qpos: np.ndarray, force_z: float) -> list[tuple[float, float]]:
@@ -270,7 +268,7 @@ def markdown(result: dict[str, Any]) -> str:
             for label, row in e[part].items():
                 m = row["metrics"]
                 shown = " | ".join(_mean(m[k]) for k in ("e_torso", "e_ee_hit", "j_upper"))
-                lines.append(f"| {name} | {label} | {_falls(row)} | {shown} | {row['displacement_z']:+.3f} |")
+                lines.append(f"| {name} | {label} | {_falls(row)} | {shown} | {_mean(row['displacement_z'])} |")
     lines += ["", "## Periodic load of 30 N, 4 s, both hands: left alpha 0.7 at 500 N/m, right PD", ""]
     lines += [
         "| engine | arm | elbow torque [Nm] | of it statics | hand swing [m] | of it statics |",
@@ -278,10 +276,8 @@ def markdown(result: dict[str, Any]) -> str:
     ]
     for name, e in engines.items():
         for side, arm in e["periodic-load"]["arms"].items():
-            cells = (
-                arm[k] for k in ("elbow_torque_nm", "elbow_torque_statics_nm", "hand_swing_m", "hand_swing_statics_m")
-            )
-            lines.append(f"| {name} | {side} | " + " | ".join("-" if v is None else f"{v:.3f}" for v in cells) + " |")
+            cells = ("-" if arm[key] is None else f"{arm[key]:.3f}" for key in SWINGS)
+            lines.append(f"| {name} | {side} | " + " | ".join(cells) + " |")
     lines += ["", "## Perturbations", "", "| what is wrong, fell | " + " | ".join(engines) + " |"]
     lines.append("|---" * (len(engines) + 1) + "|")
     for label in next(iter(engines.values()))["perturbations"]:
@@ -316,7 +312,7 @@ def figure(result: dict[str, Any], path: Any) -> None:
         p, axis = e["periodic-load"], row[2]
         for side, color in (("left", "#2171b5"), ("right", "#d95f02")):
             law = "alpha 0.7, 500 N/m" if side == "left" else "PD"
-            axis.plot(p["time"], p["arms"][side]["torque"], color=color, lw=1.2, label=f"{side}, {law}")
+            axis.plot(p["time"], p["arms"][side].get("torque", []), color=color, lw=1.2, label=f"{side}, {law}")
         axis.set(title=f"{name}, periodic load", xlabel="time [s]", ylabel="elbow torque [Nm]")
         axis.legend(frameon=False, fontsize=7)
         for axis in row:

@@ -71,7 +71,7 @@ def run_trial(
         commands[0].give(controller.commands, robot.spec.nominal_height_m)
     start_up(robot, controller, safety, seed)
     watchdog = Watchdog(safety, robot.spec.joint_names, robot.torque_limit, dt)
-    forces, falling = scenario.forces(robot.spec, dt), TerminationConfig()
+    forces, falling = scenario.forces(robot.spec, dt, seed), TerminationConfig()
     left = math.inf
     for k in range(round(scenario.seconds / dt)):
         while commands and commands[0].at <= k * dt + 1e-9:
@@ -148,7 +148,7 @@ def trajectory(trials: list[Trial], steps: int) -> Trajectory:
     columns: dict[str, list[torch.Tensor]] = {}
     for trial in trials:
         rows = trial.rows[:steps]
-        rows = rows + [rows[-1]] * (steps - len(rows))
+        rows = rows + [rows[-1] | {"fell": torch.tensor([True])}] * (steps - len(rows))
         for name in rows[0]:
             if name == "torque":
                 continue

@@ -131,10 +131,11 @@ def swing_measures(
 
 
 def amplitude(values: torch.Tensor, period_s: float, dt: float) -> torch.Tensor:
-    """Amplitude (N,) of the part of `values` (T, N) that swings with this period, by least squares."""
+    """Amplitude (N,) of the part of `values` (T, N) that swings with this period, beside offset and drift, by least
+    squares."""
     angle = 2.0 * math.pi * dt / period_s * torch.arange(values.shape[0])
-    basis = torch.stack((torch.ones_like(angle), angle.sin(), angle.cos()), 1)
-    return torch.linalg.lstsq(basis, values).solution[1:].norm(dim=0)
+    basis = torch.stack((torch.ones_like(angle), angle, angle.sin(), angle.cos()), 1)
+    return torch.linalg.lstsq(basis, values).solution[2:].norm(dim=0)
 
 
 def swing_curve(t: Trajectory, onset: int, elbows: list[int], sides: list[str]) -> dict[str, list[float]]:
