@@ -87,7 +87,7 @@ class PipelineOptions:
     """Iterations of stage 1 from nothing to walking."""
     robust_iterations: int = 860
     """Iterations of stage 1 after that, with blows and loads on the hands."""
-    distill_iterations: int = 2525
+    distill_iterations: int = 3670
     """Iterations of stage 2."""
     seed: int = 0
     """Seed of both stages."""
