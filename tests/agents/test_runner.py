@@ -161,6 +161,27 @@ def test_a_checkpoint_of_weights_alone_starts_a_new_run(tmp_path: Path, capsys: 
     assert_same(dict(weights(runner)), dict(content["model"]))
 
 
+def test_random_numbers_of_a_graphics_card_go_on_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    drawn = {"cuda:1": torch.arange(16, dtype=torch.uint8)}
+    monkeypatch.setattr(torch.cuda, "get_rng_state", lambda device: drawn[device].clone())
+    monkeypatch.setattr(torch.cuda, "set_rng_state", lambda state, device: drawn.update({device: state}))
+    runner = make_runner(tmp_path, 1)
+    runner.learn()
+    assert "device_rng" not in load_checkpoint(checkpoint(tmp_path, 1))
+    path = str(tmp_path / "card.pt")
+    runner.device = "cuda:1"
+    runner.save(path)
+    saved = drawn.pop("cuda:1")
+    runner.load(path, map_location="cpu")
+    assert torch.equal(drawn.pop("cuda:1"), saved)
+    runner.load(str(checkpoint(tmp_path, 1)), map_location="cpu")  # made where there was no card
+    make_runner(tmp_path / "elsewhere", 1).load(path)
+    assert drawn == {}
+    save_checkpoint(tmp_path / "odd.pt", load_checkpoint(path) | {"device_rng": 3})
+    with pytest.raises(CheckpointError, match="no usable part 'device_rng': 3"):
+        runner.load(str(tmp_path / "odd.pt"), map_location="cpu")
+
+
 def test_infos_come_back(tmp_path: Path):
     runner = make_runner(tmp_path, 1)
     runner.save(str(tmp_path / "own.pt"), {"note": "kept"})

@@ -20,9 +20,11 @@ FORMAT = "cotap-checkpoint"
 VERSION = 1
 PARTS: dict[str, Any] = {
     "kind": str, "layout": dict, "agents": dict, "config": dict, "model": dict, "learner": dict, "env": dict,
-    "iteration": int, "samples": int, "wall_seconds": (int, float), "rng": torch.Tensor,
+    "iteration": int, "samples": int, "wall_seconds": (int, float), "rng": torch.Tensor, "device_rng": torch.Tensor,
 }  # fmt: skip
 """What a checkpoint of a run holds; the parts of a shipped one may be empty."""
+OPTIONAL_PARTS = {"device_rng"}
+"""Of these, what only some checkpoints hold: random numbers of the graphics card that networks were on."""
 MALFORMED = (RuntimeError, ValueError, TypeError, LookupError, AttributeError, OverflowError)
 """What code that takes over a state raises where the state is not what it should be."""
 
@@ -136,6 +138,8 @@ def require_parts(path: Path | str, content: dict[str, Any], parts: Collection[s
     """Raise CheckpointError naming the first of `parts` that is missing or not of the kind that `PARTS` says."""
     for part in parts:
         if part not in content:
+            if part in OPTIONAL_PARTS:
+                continue
             raise CheckpointError(f"checkpoint {str(path)!r} lacks its part {part!r}")
         value = content[part]
         if not isinstance(value, PARTS[part]) or (isinstance(value, (int, float)) and not value >= 0):

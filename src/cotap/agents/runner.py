@@ -273,8 +273,8 @@ class DualRunner(OnPolicyRunner):
             else:
                 fresh.append("optimisers")
             mine = self._share_of(content)
-            if content["learner"] and mine["rng"] is not None:
-                torch.set_rng_state(mine["rng"].cpu())
+            if content["learner"]:
+                self._take_random_state(mine)
             if mine["env"] and mine["env"]["episode_length"].shape[0] == env.num_envs:
                 env.load_state_dict(mine["env"])
             else:
@@ -290,12 +290,26 @@ class DualRunner(OnPolicyRunner):
         """This rank's worlds and random numbers in a checkpoint; none, if it is of another number of ranks."""
         states = [content, *content.get("others", [])]
         same_number = len(states) == self.ranks.size
-        return states[self.ranks.rank] if same_number else {"env": {}, "rng": None}
+        return states[self.ranks.rank] if same_number else {"env": {}}
 
-    def _own_state(self) -> dict[str, Any]:
+    def _own_state(self, worlds: bool = True) -> dict[str, Any]:
         """What is this rank's own."""
         env: Any = self.env
-        return {"env": env.state_dict() if self.runner_cfg.save_worlds else {}, "rng": torch.get_rng_state()}
+        saved = env.state_dict() if worlds and self.runner_cfg.save_worlds else {}
+        # Exploration and mini-batches are drawn where the networks are.
+        drawn = {"device_rng": torch.cuda.get_rng_state(self.device)} if self._on_card else {}
+        return {"env": saved, "rng": torch.get_rng_state(), **drawn}
+
+    def _take_random_state(self, mine: dict[str, Any]) -> None:
+        """Draw on as the run did that saved `mine`; what it did not save, or drew elsewhere, begins anew."""
+        if "rng" in mine:
+            torch.set_rng_state(mine["rng"].cpu())
+        if self._on_card and "device_rng" in mine:
+            torch.cuda.set_rng_state(mine["device_rng"].cpu(), self.device)
+
+    @property
+    def _on_card(self) -> bool:
+        return torch.device(self.device).type == "cuda"
 
     def _content(self, worlds: bool = True) -> dict[str, Any]:
         env: Any = self.env
@@ -306,7 +320,7 @@ class DualRunner(OnPolicyRunner):
             "config": self.config,
             "model": self.alg.model.state_dict(),
             "learner": self.alg.state_dict(),
-            **(self._own_state() if worlds else {"env": {}, "rng": torch.get_rng_state()}),
+            **self._own_state(worlds),
             "iteration": self.current_learning_iteration,
             "samples": env.samples,
             "wall_seconds": self.wall_seconds,
