@@ -32,14 +32,14 @@ def dummy() -> DummyEnv:
     return DummyEnv(WORLDS)
 
 
-def robots() -> H1Env:
+def robots(num_envs: int = WORLDS, goals: bool = False) -> H1Env:
     """Episodes so short that resets of every kind happen in a few iterations."""
     return H1Env(
         H1EnvConfig(
-            num_envs=WORLDS,
+            num_envs=num_envs,
             num_threads=1,
             terminations=TerminationConfig(episode_s=0.3),
-            observations=ObservationConfig(noise=NoiseConfig(enabled=True)),
+            observations=ObservationConfig(noise=NoiseConfig(enabled=True), goals=goals),
         )
     )
 
@@ -148,6 +148,60 @@ def test_another_number_of_worlds_goes_on_with_fresh_ones(tmp_path: Path, capsys
     content = load_checkpoint(checkpoint(tmp_path / "b", 3))
     assert content["samples"] == 2 * STEPS * WORLDS + STEPS * 16
     assert content["iteration"] == 3
+
+
+@pytest.mark.parametrize("why", ["older", "another number", "not saved", "refitted"])
+def test_curricula_go_on_in_fresh_worlds(tmp_path: Path, why: str, capsys: pytest.CaptureFixture[str]):
+    """The gantry's share, and the mean of what each world has come to."""
+    env = robots()
+    env.assistance.left = 0.25
+    env.hand_forces.scale = torch.linspace(0.0, 0.7, WORLDS)
+    env.blows.scale[:2] = 1.0
+    runner = make_runner(tmp_path, 1, env=env)
+    runner.runner_cfg.save_worlds = why != "not saved"
+    for iteration in (1, 2):
+        runner.current_learning_iteration = iteration
+        runner.save()
+    other = robots(3 if why == "another number" else WORLDS, goals=why == "refitted")
+    path = checkpoint(tmp_path, 1 if why == "older" else 2)
+    make_runner(tmp_path / "b", 1, env=other).load(str(path), other_terms=why == "refitted")
+    assert other.assistance.left == 0.25
+    torch.testing.assert_close(other.hand_forces.scale, torch.full((other.num_envs,), 0.35))
+    torch.testing.assert_close(other.blows.scale, torch.full((other.num_envs,), (2.0 + 0.2 * 6) / 8))
+    assert "and curricula" not in "".join(capsys.readouterr())
+
+
+def test_a_checkpoint_from_before_curricula_were_kept_starts_them_afresh(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    make_runner(tmp_path, 1).learn()
+    content = load_checkpoint(checkpoint(tmp_path, 1))
+    assert content.pop("progress")["level"] > 0.0
+    save_checkpoint(tmp_path / "old.pt", content)
+    runner = make_runner(tmp_path / "b", 1, env=DummyEnv(16))
+    runner.load(str(tmp_path / "old.pt"))
+    assert "no simulator states and curricula" in "".join(capsys.readouterr())
+    assert runner.env.progress() == {"level": 0.0}
+    make_runner(tmp_path / "c", 1).load(str(tmp_path / "old.pt"))
+    assert "and curricula" not in "".join(capsys.readouterr())
+
+
+@pytest.mark.parametrize(
+    ("progress", "message"),
+    [
+        (3, "no usable part 'progress': 3"),
+        ({"assistance": 0.5}, "progress must be of assistance, hand_forces, blows, got assistance"),
+        ({"assistance": 0.5, "hand_forces": 1.5, "blows": 0.0}, r"hand_forces must lie in \[0.0, 1.0\], got 1.5"),
+        ({"assistance": 0.5, "hand_forces": 1.0, "blows": "x"}, "blows must be a finite number, got 'x'"),
+    ],
+)
+def test_progress_that_is_none_is_refused(tmp_path: Path, progress: Any, message: str):
+    runner = make_runner(tmp_path, 1, env=robots())
+    runner.save()
+    content = load_checkpoint(checkpoint(tmp_path, 0))
+    save_checkpoint(tmp_path / "odd.pt", content | {"env": {}, "progress": progress})
+    with pytest.raises(CheckpointError, match=message):
+        runner.load(str(tmp_path / "odd.pt"))
 
 
 def test_a_checkpoint_of_weights_alone_starts_a_new_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -21,10 +21,12 @@ VERSION = 1
 PARTS: dict[str, Any] = {
     "kind": str, "layout": dict, "agents": dict, "config": dict, "model": dict, "learner": dict, "env": dict,
     "iteration": int, "samples": int, "wall_seconds": (int, float), "rng": torch.Tensor, "device_rng": torch.Tensor,
+    "progress": dict,
 }  # fmt: skip
 """What a checkpoint of a run holds; the parts of a shipped one may be empty."""
-OPTIONAL_PARTS = {"device_rng"}
-"""Of these, what only some checkpoints hold: random numbers of the graphics card that networks were on."""
+OPTIONAL_PARTS = {"device_rng", "progress"}
+"""What some checkpoints lack: random numbers of a graphics card, if networks were on none, and how far what fades or
+grows with success had come, if they are from before that was kept."""
 MALFORMED = (RuntimeError, ValueError, TypeError, LookupError, AttributeError, OverflowError)
 """What code that takes over a state raises where the state is not what it should be."""
 

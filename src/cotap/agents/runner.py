@@ -72,8 +72,8 @@ class TrainingFault(RuntimeError):
 
 class DualRunner(OnPolicyRunner):
     """rsl_rl's runner for two agents. Replaces its loop, its saving (all that a run depends on) and its loading
-    (no code is run from a file); needs an environment with `action_slices`, `obs_groups` and `state_dict`, and among
-    several ranks with `keep_in_step`.
+    (no code is run from a file); needs an environment with `action_slices`, `obs_groups`, `state_dict` and `progress`,
+    and among several ranks with `keep_in_step`.
 
     Args:
         env: The environment.
@@ -141,7 +141,7 @@ class DualRunner(OnPolicyRunner):
                     stopping = ranks.any(self._stop)
                     self.current_learning_iteration = it + 1
                     if ranks.size > 1:
-                        self._kept = copy.deepcopy(self._content(worlds=False))
+                        self._kept = copy.deepcopy(self._content(self._progress(), worlds=False))
                     if run_log:
                         self._log(run_log, scalars)
                     if (it + 1) % self.runner_cfg.save_interval == 0 or self._save_failed:
@@ -237,9 +237,9 @@ class DualRunner(OnPolicyRunner):
         if self.alg.guide:
             self.alg.guide.verify()
         target = Path(path) if path else self.run_dir / f"checkpoint_{self.current_learning_iteration:06d}.pt"
-        others = self.ranks.gather(self._own_state)
+        others, progress = self.ranks.gather(self._own_state), self._progress()
         if self.ranks.leads:
-            save_checkpoint(target, self._content() | {"others": others, "infos": infos or {}})
+            save_checkpoint(target, self._content(progress) | {"others": others, "infos": infos or {}})
             older = [path for path in self.run_dir.glob(CHECKPOINT_PATTERN) if path < target]
             if older:
                 _shed_simulator_states(max(older))
@@ -248,13 +248,14 @@ class DualRunner(OnPolicyRunner):
     def load(
         self, path: str, *_: Any, map_location: str | None = None, other_terms: bool = False, **__: Any
     ) -> dict:  # fmt: skip
-        """Load a checkpoint. What it lacks (a shipped one has no optimiser or simulator states) starts afresh.
+        """Load a checkpoint. What it lacks (a shipped one has no optimiser or simulator states) starts afresh; worlds
+        that do, among them those of another number of worlds or ranks, begin where its curricula had come to.
 
         Args:
             path: The file.
             map_location: Where to load it to; by default where the networks live.
             other_terms: Whether it may have been trained with other terms in its observation. Its networks are then
-                refitted to these, and all else starts afresh.
+                refitted to these, and optimisers and worlds start afresh.
 
         Raises:
             CheckpointError: the file cannot be used, or was trained for another robot or observation layout.
@@ -280,6 +281,10 @@ class DualRunner(OnPolicyRunner):
             else:
                 env.samples = content["samples"]
                 fresh.append("simulator states")
+                if "progress" in content:
+                    env.load_progress(content["progress"])
+                else:
+                    fresh.append("curricula")
         except MALFORMED as error:
             raise CheckpointError(f"checkpoint {path!r} has states that do not fit this run: {error}") from error
         if fresh:
@@ -311,7 +316,11 @@ class DualRunner(OnPolicyRunner):
     def _on_card(self) -> bool:
         return torch.device(self.device).type == "cuda"
 
-    def _content(self, worlds: bool = True) -> dict[str, Any]:
+    def _progress(self) -> dict[str, float]:
+        """How far what fades or grows with success has come, over all ranks."""
+        return self.ranks.mean_of(self.env.progress())  # pyright: ignore[reportAttributeAccessIssue]
+
+    def _content(self, progress: dict[str, float], worlds: bool = True) -> dict[str, Any]:
         env: Any = self.env
         return {
             "kind": self.config.get("stage", "base"),
@@ -324,6 +333,7 @@ class DualRunner(OnPolicyRunner):
             "iteration": self.current_learning_iteration,
             "samples": env.samples,
             "wall_seconds": self.wall_seconds,
+            "progress": progress,
         }
 
     def _observations(self) -> dict[str, torch.Tensor]:
