@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import stat
 from dataclasses import replace
 
 import numpy as np
@@ -36,6 +38,33 @@ def test_a_library_comes_back(tmp_path, spec):
         np.testing.assert_array_equal(a.root, b.root)
         assert (a.name, a.source, a.licence, a.mirrored) == (b.name, b.source, b.licence, b.mirrored)
     assert list(tmp_path.iterdir()) == [tmp_path / "x.npz"]  # no temporary file is left
+
+
+def test_a_library_is_readable_and_on_the_disk_or_not_written(tmp_path, spec, monkeypatch):
+    """As any other file that the umask allows to be read; synced before it takes the old one's place."""
+    done: list[str] = []
+    fsync, replace_file = os.fsync, os.replace
+    monkeypatch.setattr(os, "fsync", lambda handle: (done.append("sync"), fsync(handle)))
+    monkeypatch.setattr(os, "replace", lambda a, b: (done.append("rename"), replace_file(a, b)))
+    path = tmp_path / "x.npz"
+    before = os.umask(0o022)
+    try:
+        MotionLibrary([clip("a")], spec).save(path)
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE(path.stat().st_mode) == 0o644
+    assert done[:2] == ["sync", "rename"]
+    whole = path.read_bytes()
+
+    def fail(file, **_):
+        file.write(b"part")
+        raise OSError("full")
+
+    monkeypatch.setattr(np, "savez_compressed", fail)
+    with pytest.raises(OSError, match="full"):
+        MotionLibrary([clip("b")], spec).save(path)
+    assert path.read_bytes() == whole
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_select_and_unknown_names(spec):

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 from dataclasses import dataclass
 from importlib.resources import as_file, files
 from pathlib import Path
 
 import numpy as np
 
+from cotap.files import write_atomically
 from cotap.robots import RobotSpec
 
 FPS = 50.0
@@ -97,25 +96,26 @@ class MotionLibrary:
         return MotionLibrary([known[n] for n in names], spec)
 
     def save(self, path: str | Path) -> None:
-        """Write to `path` (.npz), by way of a temporary file."""
-        path = Path(path)
-        lengths = [len(c.arms) for c in self.clips]
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        try:
-            with os.fdopen(handle, "wb") as file:
-                np.savez_compressed(
-                    file, version=_VERSION, fps=FPS, robot=self.robot, joints=np.array(self.joints),
-                    names=np.array(self.names()), lengths=np.array(lengths),
-                    sources=np.array([c.source for c in self.clips]),
-                    licences=np.array([c.licence for c in self.clips]),
-                    mirrored=np.array([c.mirrored for c in self.clips]),
-                    arms=np.concatenate([c.arms for c in self.clips]).astype(np.float32),
-                    root=np.concatenate([c.root for c in self.clips]).astype(np.float32),
-                )  # fmt: skip
-            os.replace(temporary, path)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
+        """Write to `path` (.npz), whole or not at all."""
+        arrays = {
+            "version": np.array(_VERSION),
+            "fps": np.array(FPS),
+            "robot": np.array(self.robot),
+            "joints": np.array(self.joints),
+            "names": np.array(self.names()),
+            "lengths": np.array([len(c.arms) for c in self.clips]),
+            "sources": np.array([c.source for c in self.clips]),
+            "licences": np.array([c.licence for c in self.clips]),
+            "mirrored": np.array([c.mirrored for c in self.clips]),
+            "arms": np.concatenate([c.arms for c in self.clips]).astype(np.float32),
+            "root": np.concatenate([c.root for c in self.clips]).astype(np.float32),
+        }
+
+        def write(temporary: Path) -> None:
+            with temporary.open("wb") as file:
+                np.savez_compressed(file, allow_pickle=False, **arrays)
+
+        write_atomically(Path(path), write)
 
     @classmethod
     def load(cls, path: str | Path, spec: RobotSpec) -> MotionLibrary:
