@@ -113,9 +113,24 @@ def saved(tmp_path, spec, **changes):
         ({"version": 2}, "has version 2"),
         ({"lengths": np.array([11])}, "do not add up"),
         ({"lengths": np.array([5, 5])}, "entries for 1 clips"),
+        ({"fps": "abc"}, r"fps must have 0 dimensions and dtype kind f or i or u, got <U3 of shape \(\)"),
+        ({"fps": np.array([50.0, 50.0])}, r"fps must have 0 dimensions .* of shape \(2,\)"),
+        ({"version": 1.5}, "version must have 0 dimensions and dtype kind i or u, got float64"),
+        ({"names": np.array("a")}, "names must have 1 dimensions"),
+        ({"lengths": np.array([10.0])}, "lengths must have 1 dimensions and dtype kind i or u, got float64"),
+        # 64 bits wrap to the right number of frames.
+        ({"lengths": np.array([2**63 - 1, 2**63 - 1, 12]), "names": np.array(["a", "b", "c"]),
+          "sources": np.array(3 * ["-"]), "licences": np.array(3 * ["-"]), "mirrored": np.zeros(3, bool)},
+         "do not add up"),
+        ({"lengths": np.array([], int), "names": np.array([], str), "sources": np.array([], str),
+          "licences": np.array([], str), "mirrored": np.array([], bool)}, "do not add up"),
+        ({"joints": np.arange(8)}, "joints must have 1 dimensions and dtype kind U, got int64"),
+        ({"joints": np.array("a")}, "joints must have 1 dimensions"),
+        ({"arms": np.full((10, 8), "x")}, "arms must have 2 dimensions and dtype kind f, got <U1"),
+        ({"root": np.zeros(10)}, "root must have 2 dimensions"),
         ({"arms": np.array([{"evil": 1}], dtype=object)}, "damaged or no npz file of plain numbers"),
     ],
-)
+)  # fmt: skip
 def test_files_that_are_wrong_are_named(tmp_path, spec, changes, message):
     with pytest.raises(MotionError, match=message):
         MotionLibrary.load(saved(tmp_path, spec, **changes), spec)
