@@ -22,7 +22,7 @@ import tyro
 from law_figures import draw_properties, draw_static, draw_transient
 from paper_tables import PROPERTIES, STATIC
 
-from cotap.agents.checkpoint import write_atomically, write_json
+from cotap.agents.checkpoint import write_json
 from cotap.checks import require_one_of, require_range
 from cotap.compare import difference
 from cotap.configs import to_plain
@@ -35,6 +35,7 @@ from cotap.evaluation.scenario import mirrored_pose
 from cotap.evaluation.stability import Stability, energy_summary, exchanged_energy, growth_rates
 from cotap.evaluation.static import StaticStiffness, settle
 from cotap.evaluation.wrong_model import misjudge
+from cotap.files import write_atomically
 from cotap.robots import h1
 
 LOADS_N = (10.0, 30.0, 50.0)

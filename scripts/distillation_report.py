@@ -193,7 +193,7 @@ def main() -> int:
     options = parser.parse_args()
     options.evaluations.mkdir(parents=True, exist_ok=True)
     runs = Runs(options.evaluations, options.checkpoint, options.threads, options.reuse)
-    from cotap.agents.checkpoint import write_atomically
+    from cotap.files import write_atomically
 
     lines = [
         "# What distillation did",

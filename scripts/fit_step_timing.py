@@ -15,13 +15,13 @@ import numpy as np
 import torch
 
 from cotap.agents.actors import as_dict
-from cotap.agents.checkpoint import write_atomically
 from cotap.configs import from_plain
 from cotap.envs import H1Env, H1EnvConfig, step_timing
 from cotap.envs.commands import STEADY_RAD, Catch, Command
 from cotap.envs.state import RobotState
 from cotap.envs.step_timing import BINS, FallRisk, feature_reflection, features, risk_at
 from cotap.evaluation.policy import load_policy
+from cotap.files import write_atomically
 from cotap.robots import ROBOTS
 
 WATCH_S = 2.2

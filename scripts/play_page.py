@@ -283,7 +283,7 @@ class Film:
         push()
         shoot(0.4)
         if self.picture:
-            from cotap.agents.checkpoint import write_atomically
+            from cotap.files import write_atomically
 
             write_atomically(Path(self.picture), lambda p: p.write_bytes(pictures[-1]))
         shoot(1.2)
@@ -292,7 +292,7 @@ class Film:
     def _write(self, pictures: list[bytes]) -> str:
         from PIL import Image
 
-        from cotap.agents.checkpoint import write_atomically
+        from cotap.files import write_atomically
 
         size = (round(self.width * self.scale), round(self.height * self.scale))
         images = [

@@ -678,7 +678,8 @@ PARTS = {
 
 def write(folder: Path, book: Book) -> None:
     """The page and all results in one file."""
-    from cotap.agents.checkpoint import write_atomically, write_json
+    from cotap.agents.checkpoint import write_json
+    from cotap.files import write_atomically
 
     text = "\n".join(book.lines) + "\n"
     write_atomically(folder / "results.md", lambda p: p.write_text(text, encoding="utf-8"))

@@ -306,6 +306,33 @@ def test_resume_auto_begins_again_in_the_folder_of_a_run_without_checkpoints(tmp
     assert run_small(tmp_path, RESUME, "auto")["iteration"] == 2
 
 
+@pytest.mark.parametrize("twice", [False, True])
+def test_names_with_underscores_and_the_last_of_two_options_count(
+    checkpoint: Path, base: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, twice: bool
+):
+    """The config comes from the file that the weights come from."""
+    content = load_checkpoint(checkpoint)
+    content["config"]["training"]["ppo"]["gamma"] = 0.7
+    path = checkpoint.with_name("other.pt")
+    save_checkpoint(path, content)
+    out: list[train.DistillOptions] = []
+    monkeypatch.setattr(train, "train_distill", out.append)
+    first = [BASE_CHECKPOINT, base / checkpoint.name] if twice else []
+    assert run("distill", *first, "--base_checkpoint", path, "--num_envs=4", "--run_dir", tmp_path / "run") == 0
+    assert out[0].base_checkpoint == str(path)
+    assert out[0].training.ppo.gamma == 0.7
+    assert out[0].training.env.num_envs == 4
+
+
+def test_of_two_resumes_the_last_counts(checkpoint: Path, monkeypatch: pytest.MonkeyPatch):
+    folder = ["--run_dir", checkpoint.parent]
+    options = captured(monkeypatch, "base", RESUME, "nowhere.pt", *folder, f"{RESUME}=auto")
+    assert options.resume == str(checkpoint)
+    assert options.training.ppo.gamma == 0.9
+    options = captured(monkeypatch, "base", RESUME, "auto", RESUME, checkpoint, RUN_DIR, "nowhere")
+    assert options.resume == str(checkpoint)
+
+
 def test_resume_auto_needs_to_know_where(capsys: pytest.CaptureFixture[str]):
     assert run("base", *SMALL, RESUME, "auto") == 2
     assert "--run-dir" in capsys.readouterr().err

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Collection
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     import torch
@@ -18,9 +18,17 @@ def require_positive_int(name: str, value: int) -> int:
     return value
 
 
+def is_finite(value: Any) -> bool:
+    """Whether `value` is a number that a float holds; an integer may be beyond."""
+    try:
+        return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    except OverflowError:
+        return False
+
+
 def require_finite(name: str, value: float) -> float:
     """Return `value` if it is a finite number, else raise ValueError."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+    if not is_finite(value):
         raise ValueError(f"{name} must be a finite number, got {value!r}")
     return value
 

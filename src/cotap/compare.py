@@ -11,6 +11,8 @@ from typing import Annotated, Any
 
 import tyro
 
+from cotap.checks import is_finite
+
 
 @dataclass
 class CompareOptions:
@@ -64,19 +66,11 @@ def _require_summary(where: str, summary: Any) -> None:
     if not isinstance(summary, dict) or not {"mean", "ci95"} <= summary.keys():
         raise ValueError(f"{where} must have mean and ci95")
     mean, interval = summary["mean"], summary["ci95"]
-    if mean is not None and not _is_number(mean):
+    if mean is not None and not is_finite(mean):
         raise ValueError(f"{where}.mean must be a finite number or null, got {mean!r:.80}")
-    pair = isinstance(interval, list) and len(interval) == 2 and all(_is_number(x) for x in interval)
+    pair = isinstance(interval, list) and len(interval) == 2 and all(is_finite(x) for x in interval)
     if interval is not None and not pair:
         raise ValueError(f"{where}.ci95 must be two finite numbers or null, got {interval!r:.80}")
-
-
-def _is_number(value: Any) -> bool:
-    """Whether this is a number that a float holds; JSON has larger ones."""
-    try:
-        return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-    except OverflowError:
-        return False
 
 
 def compare(a: dict[str, Any], b: dict[str, Any], without_falls: bool = False) -> dict[str, Any]:

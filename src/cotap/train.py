@@ -136,24 +136,23 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _expand(args: list[str]) -> list[str]:
+    """Arguments with names as the options have them, shortcuts written out, and the checkpoint that auto means."""
     from cotap.agents.runner import CHECKPOINT_PATTERN
 
-    args = [SHORTCUTS.get(key, key) + sep + value for key, sep, value in (a.partition("=") for a in args)]
+    args = [_named(key) + sep + value for key, sep, value in (a.partition("=") for a in args)]
     if _peek(args, "--resume") != "auto":
         return args
     run_dir = _peek(args, "--run-dir")
     if not run_dir:
         raise ValueError("--resume auto looks for checkpoints in --run-dir, which is not given")
     newest = max(Path(run_dir).glob(CHECKPOINT_PATTERN), default="")
-    return ["--resume=" + str(newest) if a == "--resume=auto" else a for a in _joined(args, "--resume")]
+    return [*args, f"--resume={newest}"]  # the last one counts
 
 
-def _joined(args: list[str], option: str) -> list[str]:
-    """`option` and its value as one argument."""
-    if option not in args:
-        return args
-    i = args.index(option)
-    return [*args[:i], f"{option}={args[i + 1]}", *args[i + 2 :]]
+def _named(key: str) -> str:
+    """An option's name as `_peek` looks for it; the parser takes underscores for hyphens."""
+    key = key.replace("_", "-") if key.startswith("--") else key
+    return SHORTCUTS.get(key, key)
 
 
 def _parse_base(args: list[str]) -> BaseOptions:
@@ -213,12 +212,14 @@ def _config_of(checkpoint: str, kind: type[Any]) -> Any:
 
 
 def _peek(args: list[str], option: str) -> str:
+    """The value that the parser will find: of an option given twice, the last. Empty if it is not given."""
+    found = ""
     for i, arg in enumerate(args):
         if arg.startswith(option + "="):
-            return arg.partition("=")[2]
+            found = arg.partition("=")[2]
         if arg == option and i + 1 < len(args):
-            return args[i + 1]
-    return ""
+            found = args[i + 1]
+    return found
 
 
 def train_base(options: BaseOptions) -> Path:

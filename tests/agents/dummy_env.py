@@ -44,6 +44,7 @@ class DummyEnv(VecEnv):
         self.rng = torch.Generator().manual_seed(seed)
         self.samples = 0
         self.steps = 0
+        self.level = 0.0
         self.robot = robot
         self.episode_length_buf = torch.zeros(num_envs, dtype=torch.long)
         self.x = torch.zeros(num_envs, self.num_actions)
@@ -60,6 +61,7 @@ class DummyEnv(VecEnv):
             self.on_step(self.steps)
         self.steps += 1
         self.samples += self.num_envs
+        self.level += 0.01 * float(self.x[0, 0].abs())
         self.episode_length_buf += 1
         noise = torch.randn(self.x.shape, generator=self.rng)
         self.x = 0.9 * self.x + 0.1 * actions + 0.3 * noise
@@ -80,6 +82,7 @@ class DummyEnv(VecEnv):
             "x": self.x.clone(),
             "episode_length": self.episode_length_buf.clone(),
             "steps": self.steps,
+            "level": self.level,
             "samples": self.samples,
             "rng": self.rng.get_state(),
             "ballast": torch.zeros(20_000),  # as a simulator's state, larger than tiny networks
@@ -88,9 +91,15 @@ class DummyEnv(VecEnv):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.x = state["x"].clone()
         self.episode_length_buf = state["episode_length"].clone()
-        self.steps, self.samples = state["steps"], state["samples"]
+        self.steps, self.level, self.samples = state["steps"], state["level"], state["samples"]
         self.rng.set_state(state["rng"])
         self._observe()
+
+    def progress(self) -> dict[str, float]:
+        return {"level": self.level}
+
+    def load_progress(self, progress: dict[str, float]) -> None:
+        self.level = progress["level"]
 
     def _observe(self) -> None:
         policy = torch.cat((5.0 + 3.0 * self.x, torch.ones(self.num_envs, 1)), 1)

@@ -129,6 +129,10 @@ def test_a_stop_of_any_rank_stops_all_and_they_go_on_exactly(tmp_path: Path):
 
 def test_another_number_of_ranks_goes_on_with_fresh_worlds(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
     together(train, tmp_path, 2)
+    content = load_checkpoint(tmp_path / "checkpoint_000002.pt")
+    levels = [state["env"]["level"] for state in (content, *content["others"])]
+    assert content["progress"] == {"level": pytest.approx(sum(levels) / SIZE)}
+    assert levels[0] != levels[1]
     (alone, _), = together(train, tmp_path, 3, 2, size=1)  # fmt: skip
     assert alone["at"] == 3
     assert "no simulator states" in "".join(capfd.readouterr())

@@ -32,14 +32,14 @@ def dummy() -> DummyEnv:
     return DummyEnv(WORLDS)
 
 
-def robots() -> H1Env:
+def robots(num_envs: int = WORLDS, goals: bool = False) -> H1Env:
     """Episodes so short that resets of every kind happen in a few iterations."""
     return H1Env(
         H1EnvConfig(
-            num_envs=WORLDS,
+            num_envs=num_envs,
             num_threads=1,
             terminations=TerminationConfig(episode_s=0.3),
-            observations=ObservationConfig(noise=NoiseConfig(enabled=True)),
+            observations=ObservationConfig(noise=NoiseConfig(enabled=True), goals=goals),
         )
     )
 
@@ -150,6 +150,60 @@ def test_another_number_of_worlds_goes_on_with_fresh_ones(tmp_path: Path, capsys
     assert content["iteration"] == 3
 
 
+@pytest.mark.parametrize("why", ["older", "another number", "not saved", "refitted"])
+def test_curricula_go_on_in_fresh_worlds(tmp_path: Path, why: str, capsys: pytest.CaptureFixture[str]):
+    """The gantry's share, and the mean of what each world has come to."""
+    env = robots()
+    env.assistance.left = 0.25
+    env.hand_forces.scale = torch.linspace(0.0, 0.7, WORLDS)
+    env.blows.scale[:2] = 1.0
+    runner = make_runner(tmp_path, 1, env=env)
+    runner.runner_cfg.save_worlds = why != "not saved"
+    for iteration in (1, 2):
+        runner.current_learning_iteration = iteration
+        runner.save()
+    other = robots(3 if why == "another number" else WORLDS, goals=why == "refitted")
+    path = checkpoint(tmp_path, 1 if why == "older" else 2)
+    make_runner(tmp_path / "b", 1, env=other).load(str(path), other_terms=why == "refitted")
+    assert other.assistance.left == 0.25
+    torch.testing.assert_close(other.hand_forces.scale, torch.full((other.num_envs,), 0.35))
+    torch.testing.assert_close(other.blows.scale, torch.full((other.num_envs,), (2.0 + 0.2 * 6) / 8))
+    assert "and curricula" not in "".join(capsys.readouterr())
+
+
+def test_a_checkpoint_from_before_curricula_were_kept_starts_them_afresh(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    make_runner(tmp_path, 1).learn()
+    content = load_checkpoint(checkpoint(tmp_path, 1))
+    assert content.pop("progress")["level"] > 0.0
+    save_checkpoint(tmp_path / "old.pt", content)
+    runner = make_runner(tmp_path / "b", 1, env=DummyEnv(16))
+    runner.load(str(tmp_path / "old.pt"))
+    assert "no simulator states and curricula" in "".join(capsys.readouterr())
+    assert runner.env.progress() == {"level": 0.0}
+    make_runner(tmp_path / "c", 1).load(str(tmp_path / "old.pt"))
+    assert "and curricula" not in "".join(capsys.readouterr())
+
+
+@pytest.mark.parametrize(
+    ("progress", "message"),
+    [
+        (3, "no usable part 'progress': 3"),
+        ({"assistance": 0.5}, "progress must be of assistance, hand_forces, blows, got assistance"),
+        ({"assistance": 0.5, "hand_forces": 1.5, "blows": 0.0}, r"hand_forces must lie in \[0.0, 1.0\], got 1.5"),
+        ({"assistance": 0.5, "hand_forces": 1.0, "blows": "x"}, "blows must be a finite number, got 'x'"),
+    ],
+)
+def test_progress_that_is_none_is_refused(tmp_path: Path, progress: Any, message: str):
+    runner = make_runner(tmp_path, 1, env=robots())
+    runner.save()
+    content = load_checkpoint(checkpoint(tmp_path, 0))
+    save_checkpoint(tmp_path / "odd.pt", content | {"env": {}, "progress": progress})
+    with pytest.raises(CheckpointError, match=message):
+        runner.load(str(tmp_path / "odd.pt"))
+
+
 def test_a_checkpoint_of_weights_alone_starts_a_new_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     make_runner(tmp_path / "a", 2).learn()
     content = load_checkpoint(checkpoint(tmp_path / "a", 2))
@@ -159,6 +213,27 @@ def test_a_checkpoint_of_weights_alone_starts_a_new_run(tmp_path: Path, capsys: 
     assert "no optimisers and simulator states" in "".join(capsys.readouterr())
     assert runner.current_learning_iteration == 0
     assert_same(dict(weights(runner)), dict(content["model"]))
+
+
+def test_random_numbers_of_a_graphics_card_go_on_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    drawn = {"cuda:1": torch.arange(16, dtype=torch.uint8)}
+    monkeypatch.setattr(torch.cuda, "get_rng_state", lambda device: drawn[device].clone())
+    monkeypatch.setattr(torch.cuda, "set_rng_state", lambda state, device: drawn.update({device: state}))
+    runner = make_runner(tmp_path, 1)
+    runner.learn()
+    assert "device_rng" not in load_checkpoint(checkpoint(tmp_path, 1))
+    path = str(tmp_path / "card.pt")
+    runner.device = "cuda:1"
+    runner.save(path)
+    saved = drawn.pop("cuda:1")
+    runner.load(path, map_location="cpu")
+    assert torch.equal(drawn.pop("cuda:1"), saved)
+    runner.load(str(checkpoint(tmp_path, 1)), map_location="cpu")  # made where there was no card
+    make_runner(tmp_path / "elsewhere", 1).load(path)
+    assert drawn == {}
+    save_checkpoint(tmp_path / "odd.pt", load_checkpoint(path) | {"device_rng": 3})
+    with pytest.raises(CheckpointError, match="no usable part 'device_rng': 3"):
+        runner.load(str(tmp_path / "odd.pt"), map_location="cpu")
 
 
 def test_infos_come_back(tmp_path: Path):

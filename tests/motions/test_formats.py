@@ -325,6 +325,7 @@ def test_a_bad_clip_takes_no_other_with_it(tmp_path, spec):
         "narrow": broken_phc(dof=np.zeros((91, 12))),
         "no_fps": broken_phc(fps=None),
         "bad_fps": broken_phc(fps=0),
+        "vast_fps": broken_phc(fps=10**400),
         "uneven": broken_phc(root_rot=quaternions(30.0)[:-1]),
         "zero_quaternion": broken_phc(root_rot=np.zeros((91, 4))),
         "text": "not a clip",
@@ -334,12 +335,13 @@ def test_a_bad_clip_takes_no_other_with_it(tmp_path, spec):
     result = import_motions([path], spec, progress=False)
     assert [c.name for c in result.clips] == ["good"]
     reasons = dict(result.failures)
-    assert len(reasons) == 8
+    assert len(reasons) == 9
     for name, reason in {
         "nan": "dof is not finite at frame 7",
         "narrow": r"dof must have shape \(T, 19\), got \(91, 12\)",
         "no_fps": "lacks 'fps'",
         "bad_fps": "frame rate must be in",
+        "vast_fps": "frame rate 10{79} is no number",
         "uneven": "91 joint frames, but 91 root positions",
         "text": "is no dict",
     }.items():
@@ -360,12 +362,16 @@ def test_mixed_folders_keep_what_can_be_read(tmp_path, spec):
     (tmp_path / "legs.csv").write_text("1,2,3\n4,5,6\n")
     (tmp_path / "ragged.csv").write_text("1,2,3\n4,5\n")
     (tmp_path / "letters.csv").write_text("a,b\n")
+    (tmp_path / "beyond.json").write_text(json.dumps({"Frames": [44 * [10**400]] * 2}))
+    (tmp_path / "deep.json").write_text("[" * 100_000)
     (tmp_path / "other.npz").write_bytes(b"PK\x03\x04 not really")
     np.savez(tmp_path / "pictures.npz", pixels=np.zeros(3))
     result = import_motions([tmp_path], spec, progress=False)
     assert sorted(c.name for c in result.clips) == ["dance", "punch", "walk"]
     reasons = {Path(k).name: v for k, v in result.failures}
-    assert reasons.keys() == {"legs.csv", "ragged.csv", "letters.csv", "other.npz", "pictures.npz"}
+    assert reasons.keys() == {"legs.csv", "ragged.csv", "letters.csv", "beyond.json", "deep.json", "other.npz",
+                              "pictures.npz"}  # fmt: skip
+    assert "clip 'beyond': Frames is no table of numbers" in reasons["beyond.json"]
     assert "must have 26 columns in every line, got [3]" in reasons["legs.csv"]
     assert "got [2, 3]" in reasons["ragged.csv"]
     assert "neither AMASS (no 'poses') nor a motion library" in reasons["pictures.npz"]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import stat
 from dataclasses import replace
 
 import numpy as np
@@ -36,6 +38,33 @@ def test_a_library_comes_back(tmp_path, spec):
         np.testing.assert_array_equal(a.root, b.root)
         assert (a.name, a.source, a.licence, a.mirrored) == (b.name, b.source, b.licence, b.mirrored)
     assert list(tmp_path.iterdir()) == [tmp_path / "x.npz"]  # no temporary file is left
+
+
+def test_a_library_is_readable_and_on_the_disk_or_not_written(tmp_path, spec, monkeypatch):
+    """As any other file that the umask allows to be read; synced before it takes the old one's place."""
+    done: list[str] = []
+    fsync, replace_file = os.fsync, os.replace
+    monkeypatch.setattr(os, "fsync", lambda handle: (done.append("sync"), fsync(handle)))
+    monkeypatch.setattr(os, "replace", lambda a, b: (done.append("rename"), replace_file(a, b)))
+    path = tmp_path / "x.npz"
+    before = os.umask(0o022)
+    try:
+        MotionLibrary([clip("a")], spec).save(path)
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE(path.stat().st_mode) == 0o644
+    assert done[:2] == ["sync", "rename"]
+    whole = path.read_bytes()
+
+    def fail(file, **_):
+        file.write(b"part")
+        raise OSError("full")
+
+    monkeypatch.setattr(np, "savez_compressed", fail)
+    with pytest.raises(OSError, match="full"):
+        MotionLibrary([clip("b")], spec).save(path)
+    assert path.read_bytes() == whole
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_select_and_unknown_names(spec):
@@ -84,9 +113,24 @@ def saved(tmp_path, spec, **changes):
         ({"version": 2}, "has version 2"),
         ({"lengths": np.array([11])}, "do not add up"),
         ({"lengths": np.array([5, 5])}, "entries for 1 clips"),
+        ({"fps": "abc"}, r"fps must have 0 dimensions and dtype kind f or i or u, got <U3 of shape \(\)"),
+        ({"fps": np.array([50.0, 50.0])}, r"fps must have 0 dimensions .* of shape \(2,\)"),
+        ({"version": 1.5}, "version must have 0 dimensions and dtype kind i or u, got float64"),
+        ({"names": np.array("a")}, "names must have 1 dimensions"),
+        ({"lengths": np.array([10.0])}, "lengths must have 1 dimensions and dtype kind i or u, got float64"),
+        # 64 bits wrap to the right number of frames.
+        ({"lengths": np.array([2**63 - 1, 2**63 - 1, 12]), "names": np.array(["a", "b", "c"]),
+          "sources": np.array(3 * ["-"]), "licences": np.array(3 * ["-"]), "mirrored": np.zeros(3, bool)},
+         "do not add up"),
+        ({"lengths": np.array([], int), "names": np.array([], str), "sources": np.array([], str),
+          "licences": np.array([], str), "mirrored": np.array([], bool)}, "do not add up"),
+        ({"joints": np.arange(8)}, "joints must have 1 dimensions and dtype kind U, got int64"),
+        ({"joints": np.array("a")}, "joints must have 1 dimensions"),
+        ({"arms": np.full((10, 8), "x")}, "arms must have 2 dimensions and dtype kind f, got <U1"),
+        ({"root": np.zeros(10)}, "root must have 2 dimensions"),
         ({"arms": np.array([{"evil": 1}], dtype=object)}, "damaged or no npz file of plain numbers"),
     ],
-)
+)  # fmt: skip
 def test_files_that_are_wrong_are_named(tmp_path, spec, changes, message):
     with pytest.raises(MotionError, match=message):
         MotionLibrary.load(saved(tmp_path, spec, **changes), spec)

@@ -6,62 +6,33 @@ import contextlib
 import hashlib
 import io
 import json
-import os
 import reprlib
-import tempfile
 import zipfile
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from cotap.files import write_atomically
+
 FORMAT = "cotap-checkpoint"
 VERSION = 1
 PARTS: dict[str, Any] = {
     "kind": str, "layout": dict, "agents": dict, "config": dict, "model": dict, "learner": dict, "env": dict,
-    "iteration": int, "samples": int, "wall_seconds": (int, float), "rng": torch.Tensor,
+    "iteration": int, "samples": int, "wall_seconds": (int, float), "rng": torch.Tensor, "device_rng": torch.Tensor,
+    "progress": dict,
 }  # fmt: skip
 """What a checkpoint of a run holds; the parts of a shipped one may be empty."""
+OPTIONAL_PARTS = {"device_rng", "progress"}
+"""What some checkpoints lack: random numbers of a graphics card, if networks were on none, and how far what fades or
+grows with success had come, if they are from before that was kept."""
 MALFORMED = (RuntimeError, ValueError, TypeError, LookupError, AttributeError, OverflowError)
 """What code that takes over a state raises where the state is not what it should be."""
 
 
 class CheckpointError(ValueError):
     """A file that cannot be used as a checkpoint; the message names it and says why."""
-
-
-def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
-    """Let `write` fill a temporary file beside `path`, then rename it: readers see the old file or the new, whole.
-
-    Raises:
-        OSError: the disk is full or the folder not writable; nothing is left behind, and an old file is untouched.
-    """
-    handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent)
-    os.close(handle)
-    os.umask(mask := os.umask(0))  # the only way to read it
-    os.chmod(name, 0o666 & ~mask)  # a temporary file is private; the file that it becomes is like any other
-    temporary = Path(name)
-    try:
-        write(temporary)
-        with temporary.open("rb") as f:
-            os.fsync(f.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
-        raise
-    _sync_folder(path.parent)
-
-
-def _sync_folder(folder: Path) -> None:
-    """Make a rename last through a power cut, where the system can."""
-    with contextlib.suppress(OSError):  # Windows opens no folders, and some file systems sync none
-        handle = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
 
 
 def remove_leftovers(folder: Path) -> int:
@@ -136,6 +107,8 @@ def require_parts(path: Path | str, content: dict[str, Any], parts: Collection[s
     """Raise CheckpointError naming the first of `parts` that is missing or not of the kind that `PARTS` says."""
     for part in parts:
         if part not in content:
+            if part in OPTIONAL_PARTS:
+                continue
             raise CheckpointError(f"checkpoint {str(path)!r} lacks its part {part!r}")
         value = content[part]
         if not isinstance(value, PARTS[part]) or (isinstance(value, (int, float)) and not value >= 0):

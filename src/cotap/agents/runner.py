@@ -72,8 +72,8 @@ class TrainingFault(RuntimeError):
 
 class DualRunner(OnPolicyRunner):
     """rsl_rl's runner for two agents. Replaces its loop, its saving (all that a run depends on) and its loading
-    (no code is run from a file); needs an environment with `action_slices`, `obs_groups` and `state_dict`, and among
-    several ranks with `keep_in_step`.
+    (no code is run from a file); needs an environment with `action_slices`, `obs_groups`, `state_dict` and `progress`,
+    and among several ranks with `keep_in_step`.
 
     Args:
         env: The environment.
@@ -141,7 +141,7 @@ class DualRunner(OnPolicyRunner):
                     stopping = ranks.any(self._stop)
                     self.current_learning_iteration = it + 1
                     if ranks.size > 1:
-                        self._kept = copy.deepcopy(self._content(worlds=False))
+                        self._kept = copy.deepcopy(self._content(self._progress(), worlds=False))
                     if run_log:
                         self._log(run_log, scalars)
                     if (it + 1) % self.runner_cfg.save_interval == 0 or self._save_failed:
@@ -237,9 +237,9 @@ class DualRunner(OnPolicyRunner):
         if self.alg.guide:
             self.alg.guide.verify()
         target = Path(path) if path else self.run_dir / f"checkpoint_{self.current_learning_iteration:06d}.pt"
-        others = self.ranks.gather(self._own_state)
+        others, progress = self.ranks.gather(self._own_state), self._progress()
         if self.ranks.leads:
-            save_checkpoint(target, self._content() | {"others": others, "infos": infos or {}})
+            save_checkpoint(target, self._content(progress) | {"others": others, "infos": infos or {}})
             older = [path for path in self.run_dir.glob(CHECKPOINT_PATTERN) if path < target]
             if older:
                 _shed_simulator_states(max(older))
@@ -248,13 +248,14 @@ class DualRunner(OnPolicyRunner):
     def load(
         self, path: str, *_: Any, map_location: str | None = None, other_terms: bool = False, **__: Any
     ) -> dict:  # fmt: skip
-        """Load a checkpoint. What it lacks (a shipped one has no optimiser or simulator states) starts afresh.
+        """Load a checkpoint. What it lacks (a shipped one has no optimiser or simulator states) starts afresh; worlds
+        that do, among them those of another number of worlds or ranks, begin where its curricula had come to.
 
         Args:
             path: The file.
             map_location: Where to load it to; by default where the networks live.
             other_terms: Whether it may have been trained with other terms in its observation. Its networks are then
-                refitted to these, and all else starts afresh.
+                refitted to these, and optimisers and worlds start afresh.
 
         Raises:
             CheckpointError: the file cannot be used, or was trained for another robot or observation layout.
@@ -273,13 +274,17 @@ class DualRunner(OnPolicyRunner):
             else:
                 fresh.append("optimisers")
             mine = self._share_of(content)
-            if content["learner"] and mine["rng"] is not None:
-                torch.set_rng_state(mine["rng"].cpu())
+            if content["learner"]:
+                self._take_random_state(mine)
             if mine["env"] and mine["env"]["episode_length"].shape[0] == env.num_envs:
                 env.load_state_dict(mine["env"])
             else:
                 env.samples = content["samples"]
                 fresh.append("simulator states")
+                if "progress" in content:
+                    env.load_progress(content["progress"])
+                else:
+                    fresh.append("curricula")
         except MALFORMED as error:
             raise CheckpointError(f"checkpoint {path!r} has states that do not fit this run: {error}") from error
         if fresh:
@@ -290,14 +295,32 @@ class DualRunner(OnPolicyRunner):
         """This rank's worlds and random numbers in a checkpoint; none, if it is of another number of ranks."""
         states = [content, *content.get("others", [])]
         same_number = len(states) == self.ranks.size
-        return states[self.ranks.rank] if same_number else {"env": {}, "rng": None}
+        return states[self.ranks.rank] if same_number else {"env": {}}
 
-    def _own_state(self) -> dict[str, Any]:
+    def _own_state(self, worlds: bool = True) -> dict[str, Any]:
         """What is this rank's own."""
         env: Any = self.env
-        return {"env": env.state_dict() if self.runner_cfg.save_worlds else {}, "rng": torch.get_rng_state()}
+        saved = env.state_dict() if worlds and self.runner_cfg.save_worlds else {}
+        # Exploration and mini-batches are drawn where the networks are.
+        drawn = {"device_rng": torch.cuda.get_rng_state(self.device)} if self._on_card else {}
+        return {"env": saved, "rng": torch.get_rng_state(), **drawn}
 
-    def _content(self, worlds: bool = True) -> dict[str, Any]:
+    def _take_random_state(self, mine: dict[str, Any]) -> None:
+        """Draw on as the run did that saved `mine`; what it did not save, or drew elsewhere, begins anew."""
+        if "rng" in mine:
+            torch.set_rng_state(mine["rng"].cpu())
+        if self._on_card and "device_rng" in mine:
+            torch.cuda.set_rng_state(mine["device_rng"].cpu(), self.device)
+
+    @property
+    def _on_card(self) -> bool:
+        return torch.device(self.device).type == "cuda"
+
+    def _progress(self) -> dict[str, float]:
+        """How far what fades or grows with success has come, over all ranks."""
+        return self.ranks.mean_of(self.env.progress())  # pyright: ignore[reportAttributeAccessIssue]
+
+    def _content(self, progress: dict[str, float], worlds: bool = True) -> dict[str, Any]:
         env: Any = self.env
         return {
             "kind": self.config.get("stage", "base"),
@@ -306,10 +329,11 @@ class DualRunner(OnPolicyRunner):
             "config": self.config,
             "model": self.alg.model.state_dict(),
             "learner": self.alg.state_dict(),
-            **(self._own_state() if worlds else {"env": {}, "rng": torch.get_rng_state()}),
+            **self._own_state(worlds),
             "iteration": self.current_learning_iteration,
             "samples": env.samples,
             "wall_seconds": self.wall_seconds,
+            "progress": progress,
         }
 
     def _observations(self) -> dict[str, torch.Tensor]:

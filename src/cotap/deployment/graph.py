@@ -17,7 +17,7 @@ from torch import nn
 
 from cotap import __version__
 from cotap.agents.actors import DualActorCritic
-from cotap.agents.checkpoint import CheckpointError, sha256, write_atomically
+from cotap.agents.checkpoint import CheckpointError, sha256
 from cotap.configs import from_plain, to_plain
 from cotap.deployment.metadata import ACTION, FORMAT, INPUT, TARGETS, PolicyMetadata
 from cotap.deployment.policy import OnnxPolicy
@@ -26,6 +26,7 @@ from cotap.envs.actions import JointTargets
 from cotap.envs.commands import Command
 from cotap.envs.observations import ObservationHistory, actor_terms
 from cotap.evaluation.policy import load_policy
+from cotap.files import write_atomically
 from cotap.robots import ROBOTS, RobotSpec
 from cotap.robots.mjcf import build_model
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import math
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
@@ -86,12 +86,12 @@ def read_metadata(where: str, properties: Mapping[str, str]) -> PolicyMetadata:
     for name in names:
         try:
             values[name] = json.loads(properties[name])
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:  # not JSON, or nested without end
             raise PolicyError(f"{where}: metadata {name} is not JSON: {error}") from error
     metadata = PolicyMetadata(**values)
     try:
         _check(metadata)
-    except (ValueError, TypeError, LookupError) as error:
+    except (ValueError, TypeError, LookupError, RecursionError) as error:
         raise PolicyError(f"{where}: {error or type(error).__name__}") from error
     return metadata
 
@@ -108,7 +108,7 @@ def _check(m: PolicyMetadata) -> None:
         if len(values) != len(m.joints):
             raise ValueError(f"metadata {name} has {len(values)} entries for {len(m.joints)} joints")
         flat = [v for entry in values for v in entry] if name == "joint_range_rad" else values
-        if not all(isinstance(v, (int, float)) and math.isfinite(v) for v in flat):
+        if not all(_is_finite(v) for v in flat):
             raise ValueError(f"metadata {name} holds what is not a finite number: {values}")
     if not isinstance(m.control_dt, (int, float)) or not 1e-4 <= m.control_dt <= 1.0:
         raise ValueError(f"metadata control_dt must lie in [0.0001, 1.0] s, got {m.control_dt!r}")
@@ -118,6 +118,10 @@ def _check(m: PolicyMetadata) -> None:
         if absent:
             raise ValueError(f"metadata {part} lacks {absent[0]!r}")
     for term in m.observation["terms"]:
-        name, width, scale = term
-        if not isinstance(name, str) or not isinstance(width, int) or not math.isfinite(scale):
+        if not (len(term) == 3 and isinstance(term[0], str) and isinstance(term[1], int) and _is_finite(term[2])):
             raise ValueError(f"metadata observation has a term that is not (name, width, scale): {term}")
+
+
+def _is_finite(value: Any) -> bool:
+    """Whether this is a number that a float holds; JSON has larger ones."""
+    return isinstance(value, (int, float)) and abs(value) <= sys.float_info.max

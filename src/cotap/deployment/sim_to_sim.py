@@ -149,7 +149,7 @@ def _keep(path: Path | None, about: dict[str, Any], measure: Callable[[], dict[s
     # What is run in one engine does not depend on which others there are.
     about = json.loads(json.dumps({name: value for name, value in about.items() if name != "engines"}))
     if path and path.is_file():
-        with contextlib.suppress(ValueError):  # not JSON: run it again
+        with contextlib.suppress(ValueError, RecursionError):  # not JSON: run it again
             before = json.loads(path.read_text(encoding="utf-8"))
             if before.get("about") == about:
                 return before["result"]

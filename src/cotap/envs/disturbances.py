@@ -180,10 +180,18 @@ class Assistance(Stateful):
 
     def share(self, samples: float) -> float:
         """Share of the assistance left after `samples` environment steps."""
-        left = float(self._share)
-        if not self.cfg.enabled or samples >= self.cfg.end_samples or left < _LAST_SHARE:
+        if not self.cfg.enabled or samples >= self.cfg.end_samples or self.left < _LAST_SHARE:
             return 0.0
-        return left
+        return self.left
+
+    @property
+    def left(self) -> float:
+        """To what share it has faded, in [0, 1]."""
+        return float(self._share)
+
+    @left.setter
+    def left(self, value: float) -> None:
+        self._share = torch.full_like(self._share, value)
 
     def step(self, falls: torch.Tensor, samples: float) -> None:
         """Learn of the falls (N,) of one control step; falls are averaged over about a second."""

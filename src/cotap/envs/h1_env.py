@@ -416,6 +416,24 @@ class H1Env(VecEnv):
             self.rng.set_state(state["rng"].cpu())
         self.state = self.reader.read()
 
+    def progress(self) -> dict[str, float]:
+        """How far has come what fades or grows with success, whatever the number of worlds: shares in [0, 1]."""
+        return {
+            "assistance": self.assistance.left,
+            "hand_forces": float(self.hand_forces.scale.mean()),
+            "blows": float(self.blows.scale.mean()),
+        }
+
+    def load_progress(self, progress: dict[str, float]) -> None:
+        """Let all worlds go on from what `progress` returned. Raises ValueError for anything else."""
+        if progress.keys() != self.progress().keys():
+            raise ValueError(f"progress must be of {', '.join(self.progress())}, got {', '.join(map(str, progress))}")
+        for name, share in progress.items():
+            require_range(f"progress of {name}", share, 0.0, 1.0)
+        self.assistance.left = progress["assistance"]
+        for name, part in (("hand_forces", self.hand_forces), ("blows", self.blows)):
+            part.scale = torch.full_like(part.scale, progress[name])
+
     def keep_in_step(self, mean: Callable[[torch.Tensor], torch.Tensor]) -> None:
         """Replace what all worlds share, and learn from their falls, by its mean over processes."""
         self.assistance.keep_in_step(mean)

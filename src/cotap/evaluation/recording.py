@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from cotap.agents.checkpoint import write_atomically
 from cotap.checks import require_range
 from cotap.evaluation.disturbance import response_measures, window_measures
 from cotap.evaluation.metrics import summarize, tracking_measures
 from cotap.evaluation.rollout import STEPPED, Trajectory
+from cotap.files import write_atomically
 
 FORMAT, VERSION = "cotap-recording", 1
 SCENE = {

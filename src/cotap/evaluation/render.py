@@ -13,10 +13,10 @@ import numpy as np
 import torch
 
 from cotap.agents.actors import as_dict
-from cotap.agents.checkpoint import write_atomically
 from cotap.envs import H1Env, H1EnvConfig
 from cotap.envs.commands import STEADY_RAD
 from cotap.evaluation.rollout import PolicyFunction
+from cotap.files import write_atomically
 from cotap.robots import RobotSpec
 from cotap.robots.mjcf import build_model
 

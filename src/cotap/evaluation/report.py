@@ -7,9 +7,9 @@ from typing import Any
 
 import torch
 
-from cotap.agents.checkpoint import write_atomically
 from cotap.evaluation.metrics import moving_average, settled
 from cotap.evaluation.rollout import Trajectory
+from cotap.files import write_atomically
 
 UNITS = {
     "e_lin": "m/s", "e_lin_gait": "m/s", "e_yaw": "rad/s", "e_yaw_gait": "rad/s", "e_height": "m", "e_upper": "rad",

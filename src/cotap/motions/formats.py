@@ -104,7 +104,7 @@ def _numbers(name: str, what: str, value: Any, columns: int | None = None, at_le
     """`value` as a finite (T, columns) array of floats, or a MotionError that names the clip."""
     try:
         array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise MotionError(f"clip {name!r}: {what} is no table of numbers ({error})") from error
     wanted = f"(T, {columns})" if columns is not None else f"(T, at least {at_least})"
     if array.ndim != 2 or array.shape[1] < at_least or (columns is not None and array.shape[1] != columns):
@@ -175,8 +175,8 @@ def _amass(path: Path) -> HumanMotion:
 def _rate(name: str, value: Any) -> float:
     try:
         fps = float(value)
-    except (TypeError, ValueError) as error:
-        raise MotionError(f"clip {name!r}: frame rate {value!r} is no number") from error
+    except (TypeError, ValueError, OverflowError) as error:
+        raise MotionError(f"clip {name!r}: frame rate {value!r:.80} is no number") from error
     if not 1.0 <= fps <= 10_000.0:
         raise MotionError(f"clip {name!r}: frame rate must be in [1, 10000] Hz, got {fps}")
     return fps

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
+import itertools
 from dataclasses import dataclass
 from importlib.resources import as_file, files
 from pathlib import Path
 
 import numpy as np
 
+from cotap.files import write_atomically
 from cotap.robots import RobotSpec
 
 FPS = 50.0
 """Frame rate of all libraries [Hz]."""
 _VERSION = 1
+ENTRIES = {
+    "version": ("iu", 0), "fps": ("fiu", 0), "robot": ("U", 0), "joints": ("U", 1), "names": ("U", 1),
+    "lengths": ("iu", 1), "sources": ("U", 1), "licences": ("U", 1), "mirrored": ("b", 1), "arms": ("f", 2),
+    "root": ("f", 2),
+}  # fmt: skip
+"""What is in a library's file: numpy's kinds of dtype, and the number of dimensions."""
 
 
 class MotionError(ValueError):
@@ -97,25 +103,26 @@ class MotionLibrary:
         return MotionLibrary([known[n] for n in names], spec)
 
     def save(self, path: str | Path) -> None:
-        """Write to `path` (.npz), by way of a temporary file."""
-        path = Path(path)
-        lengths = [len(c.arms) for c in self.clips]
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        try:
-            with os.fdopen(handle, "wb") as file:
-                np.savez_compressed(
-                    file, version=_VERSION, fps=FPS, robot=self.robot, joints=np.array(self.joints),
-                    names=np.array(self.names()), lengths=np.array(lengths),
-                    sources=np.array([c.source for c in self.clips]),
-                    licences=np.array([c.licence for c in self.clips]),
-                    mirrored=np.array([c.mirrored for c in self.clips]),
-                    arms=np.concatenate([c.arms for c in self.clips]).astype(np.float32),
-                    root=np.concatenate([c.root for c in self.clips]).astype(np.float32),
-                )  # fmt: skip
-            os.replace(temporary, path)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
+        """Write to `path` (.npz), whole or not at all."""
+        arrays = {
+            "version": np.array(_VERSION),
+            "fps": np.array(FPS),
+            "robot": np.array(self.robot),
+            "joints": np.array(self.joints),
+            "names": np.array(self.names()),
+            "lengths": np.array([len(c.arms) for c in self.clips]),
+            "sources": np.array([c.source for c in self.clips]),
+            "licences": np.array([c.licence for c in self.clips]),
+            "mirrored": np.array([c.mirrored for c in self.clips]),
+            "arms": np.concatenate([c.arms for c in self.clips]).astype(np.float32),
+            "root": np.concatenate([c.root for c in self.clips]).astype(np.float32),
+        }
+
+        def write(temporary: Path) -> None:
+            with temporary.open("wb") as file:
+                np.savez_compressed(file, allow_pickle=False, **arrays)
+
+        write_atomically(Path(path), write)
 
     @classmethod
     def load(cls, path: str | Path, spec: RobotSpec) -> MotionLibrary:
@@ -125,34 +132,39 @@ class MotionLibrary:
             MotionError: the file is missing, damaged, of another kind or for another robot.
         """
         content = read_npz(path)
-        missing = {"version", "fps", "robot", "joints", "names", "lengths", "sources", "licences", "mirrored", "arms",
-                   "root"} - content.keys()  # fmt: skip
+        missing = ENTRIES.keys() - content.keys()
         if missing:
             raise MotionError(f"{str(path)!r} is no motion library: it lacks {sorted(missing)[0]!r}")
+        for key, (kinds, dimensions) in ENTRIES.items():
+            if content[key].dtype.kind not in kinds or content[key].ndim != dimensions:
+                raise MotionError(
+                    f"{str(path)!r} is no motion library: {key} must have {dimensions} dimensions and dtype kind "
+                    f"{' or '.join(kinds)}, got {content[key].dtype} of shape {content[key].shape}"
+                )
         if tuple(content["joints"].tolist()) != spec.upper_joints or str(content["robot"]) != spec.name:
             raise MotionError(
                 f"{str(path)!r} is for the arms of {str(content['robot'])!r} "
                 f"({', '.join(content['joints'].tolist())}), not of {spec.name!r} ({', '.join(spec.upper_joints)})"
             )
-        if float(content["fps"]) != FPS or int(content["version"]) != _VERSION:
+        if content["fps"] != FPS or content["version"] != _VERSION:
             raise MotionError(
                 f"{str(path)!r} has version {content['version']} at {content['fps']} Hz; "
                 f"this release reads version {_VERSION} at {FPS:g} Hz"
             )
-        lengths = content["lengths"]
+        lengths = content["lengths"].tolist()
         count = len(content["names"])
         for key in ("lengths", "sources", "licences", "mirrored"):
             if content[key].shape != (count,):
                 raise MotionError(f"{str(path)!r}: {key} has {content[key].shape} entries for {count} clips")
-        if lengths.size == 0 or lengths.min() < 1 or lengths.sum() != len(content["arms"]):
+        if min(lengths, default=0) < 1 or sum(lengths) != len(content["arms"]):
             raise MotionError(f"{str(path)!r}: clip lengths do not add up to its {len(content['arms'])} frames")
-        stops = np.cumsum(lengths)
+        stops = itertools.accumulate(lengths)
         clips = [
             MotionClip(
                 str(content["names"][i]), content["arms"][stop - n : stop], content["root"][stop - n : stop],
                 str(content["sources"][i]), str(content["licences"][i]), bool(content["mirrored"][i]),
             )
-            for i, (n, stop) in enumerate(zip(lengths.tolist(), stops.tolist(), strict=True))
+            for i, (n, stop) in enumerate(zip(lengths, stops, strict=True))
         ]  # fmt: skip
         return cls(clips, spec)
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from cotap.agents.checkpoint import write_atomically
 from cotap.evaluation.render import RenderingUnavailable, contact_sheet, render_frames
+from cotap.files import write_atomically
 from cotap.motions.library import FPS, MotionClip, MotionLibrary
 from cotap.motions.quality import forward_kinematics
 from cotap.robots import RobotSpec
