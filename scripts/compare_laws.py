@@ -302,7 +302,7 @@ class Properties:
                 "softer_over_stiffer": soft / stiff,
                 "wrong_over_right_displacement": wrong / right,
                 "wrong_model_shift": float((misled - at).norm()),
-                "linearised": growth_rates(h1(), arms.left, self.stability),
+                "linearised": growth_rates(h1(), arms.built(arms.left), self.stability),
                 "energy": energy_summary(exchanged_energy(H1Env(cfg), self.stability)),
             }
             print(f"  {name}", file=sys.stderr)
