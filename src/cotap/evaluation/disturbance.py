@@ -64,8 +64,9 @@ class Impact(Scenario):
 
     def configure(self, env: H1EnvConfig) -> H1EnvConfig:
         """Turn the environment that a policy was trained in into this protocol's. Changes and returns `env`."""
+        super().configure(env)
         env.force = self._profile()
-        return super().configure(env)
+        return env
 
     def hit(self, env: H1Env) -> list[int]:
         """Indices of the hands whose error is `e_ee_hit`: those that the force is on, all for a force on the base."""

@@ -16,6 +16,7 @@ from cotap.envs import H1Env, H1EnvConfig
 from cotap.envs.commands import STEADY_RAD
 from cotap.envs.reference import ClipConfig, load_clips
 from cotap.evaluation.metrics import summarize
+from cotap.evaluation.quiet import quiet
 from cotap.evaluation.report import save_figure
 from cotap.evaluation.rollout import PolicyFunction
 from cotap.evaluation.scenario import PELVIS
@@ -74,11 +75,10 @@ class Fidelity:
     def configure(self, env: H1EnvConfig) -> H1EnvConfig:
         """Turn an environment into this protocol's. Changes and returns `env`."""
         self.check()
+        quiet(env)
         env.num_envs, env.seed, env.torque_limit_scale = self.num_envs, self.seed, self.torque_limit_scale
-        env.assist.enabled = env.hand_forces.enabled = env.blows.enabled = env.randomization.enabled = False
-        env.observations.noise.enabled = False
         env.fixed_base = self.pelvis == "fixed"
-        env.motions.clips.share, env.impedance.share = 0.0, 0.0
+        env.motions.clips.share = 0.0
         env.terminations.episode_s = 1e6
         env.commands.steady_rad = STEADY_RAD
         env.commands.stand_probability, env.commands.height_offset = 1.0, (0.0, 0.0)

@@ -18,6 +18,7 @@ from cotap.envs import H1Env, H1EnvConfig
 from cotap.envs.commands import STEADY_RAD
 from cotap.envs.reference import REST
 from cotap.evaluation.policy import Policy, load_policy
+from cotap.evaluation.quiet import quiet
 from cotap.play.controls import AXES, ROBOTS, Control, Ranges, make_controls
 from cotap.play.forces import HandLoads, Push
 from cotap.play.sample import Sample, take_sample
@@ -206,11 +207,10 @@ class Session:
 
 def play_config(env: H1EnvConfig) -> H1EnvConfig:
     """Turn the environment that a policy was trained in into the page's. Changes and returns `env`."""
+    quiet(env)
     env.num_envs, env.num_threads, env.backend = len(ROBOTS), 1, "mjbatch"
-    env.assist.enabled = env.hand_forces.enabled = env.blows.enabled = env.randomization.enabled = False
-    env.observations.noise.enabled = False
     env.terminations.episode_s = 1e6
-    env.impedance.share, env.commands.steady_rad = 0.0, STEADY_RAD
+    env.commands.steady_rad = STEADY_RAD
     env.upper_body.sampling.enabled = False  # what the page sets stays
     env.motions.clips.share, env.motions.clips.only, env.motions.clips.held_out = 1.0, (), ()
     for weights in (env.rewards.lower, env.rewards.upper):  # nobody learns here; a group must have one term
