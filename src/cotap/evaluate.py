@@ -309,11 +309,12 @@ def static_stiffness(options: StaticStiffnessOptions) -> dict[str, Any]:
 def fidelity(options: FidelityOptions) -> dict[str, Any]:
     """Measure, print the table, write what was asked for, and return the result."""
     from cotap.agents.checkpoint import write_json
+    from cotap.compliance.laws import WITHOUT_STIFFNESS
     from cotap.evaluation.fidelity import measure, plot, summary, table
 
     protocol = options.protocol
     env, policy, checkpoint = _prepare(options, protocol)
-    if env.cfg.upper_body.of(protocol.hand).name in ("pd", "soft-pd"):
+    if env.cfg.upper_body.of(protocol.hand).name in WITHOUT_STIFFNESS:
         raise ValueError("fidelity needs a law with a stiffness at the hand, such as --method cotap")
     start = time.perf_counter()
     measured, coverage = measure(env, protocol, policy)
