@@ -275,9 +275,9 @@ class Properties:
     load: float = 5.0
     """Downward, on the left hand [N]."""
     wrong_length: float = 1.1
-    """Factor on the arms' links in the law's model, but not in the arms."""
+    """Factor on joint offsets and centres of mass, but for each arm's first link's, in the law's model."""
     wrong_mass: float = 1.2
-    """The same of their masses."""
+    """Factor on the masses of the same links there."""
     settle_seconds: float = 8.0
     """How long a load is left to settle [s]."""
     threads: int = 0
@@ -362,8 +362,11 @@ class Properties:
                     f"| {name} | {key.split('_')[0]} | {least} | {e['share_drawn']:.1%} of {e['trials']} "
                     f"| {e['num_diverged']} |"
                 )
-        poses = f"{self.stability.poses} poses; a wrong model has links {self.wrong_length:g} times as long"
-        return "\n".join([*lines, "", f"{poses} and {self.wrong_mass:g} times as heavy as they are."])
+        wrong = (
+            f"a wrong model has joint offsets and centres of mass {self.wrong_length:g} times as far out and masses "
+            f"{self.wrong_mass:g} times as large as they are, but for each arm's first link; rotational inertias stay."
+        )
+        return "\n".join([*lines, "", f"{self.stability.poses} poses; {wrong}"])
 
     def draw(self, result: dict[str, Any]) -> Any:
         """Bars per law."""

@@ -80,6 +80,32 @@ def test_a_recording_holds_what_was_shown_and_a_change_of_robots_ends_it(app):
     assert app.archive.path.name == "recording_002.npz"
 
 
+def test_a_recording_logs_what_came_into_force_pauses_included(app):
+    app.mailbox.set("a.left.alpha", 0.75)
+    app.mailbox.ask(Record(True))
+    app.advance()
+    app.mailbox.set("paused", True)
+    app.mailbox.set("a.left.stiffness_x", 600.0)
+    app.advance()
+    app.mailbox.set("a.left.stiffness_x", 700.0)
+    app.mailbox.set("a.checkpoint", "missing")  # cannot be read: not in force
+    app.advance()
+    app.mailbox.set("paused", False)
+    app.advance()
+    app.mailbox.set("stand", False)
+    app.advance()
+    app.mailbox.ask(Record(False))
+    app.advance()
+    settings = load_recording(app.archive.path).settings
+    assert settings["values"]["a.left.alpha"] == 0.75
+    assert settings["values"]["a.left.stiffness_x"] == 300.0
+    dt = app.session.dt
+    assert settings["changes"] == [
+        {"time": dt, "values": {"a.left.stiffness_x": 700.0, "paused": False}},
+        {"time": 2 * dt, "values": {"stand": False}},
+    ]
+
+
 def test_a_checkpoint_that_is_refused_is_shown_as_it_was(app):
     app.mailbox.set("a.checkpoint", "missing")
     app.advance()
