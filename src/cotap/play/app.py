@@ -72,11 +72,16 @@ class App:
         values, requests = self.mailbox.take()
         before = dict(self.session.values)
         notices = self.session.set(values)
-        self._changes |= {name: value for name, value in self.session.values.items() if value != before[name]}
+        changes = {name: value for name, value in self.session.values.items() if value != before[name]}
+        self._changes |= changes
         if notices:
             self.panel.put_back({name: self.session.values[name] for name in values if name in self.session.values})
         for notice in notices:
             self.notices.tell(notice, title="not possible")
+        for robot in ROBOTS:
+            checkpoint = changes.get(f"{robot}.checkpoint")
+            if checkpoint and (text := self.session.trained_otherwise(checkpoint)):
+                self.notices.tell(text, title=f"robot {robot.upper()}: another gait")
         if "side_by_side" in values:
             self._keep_recording()
         step = False

@@ -23,6 +23,9 @@ from cotap.play.controls import AXES, ROBOTS, Control, Ranges, make_controls
 from cotap.play.forces import HandLoads, Push
 from cotap.play.sample import Sample, take_sample
 
+GAIT = ("gait_period_s", "step_apart_m", "step_clear_m", "step_timing")
+"""Fields of `CommandConfig` that shape what is fed forward to the legs."""
+
 
 class Session:
     """Robots a and b, always both simulated: a batch of two costs what one does. `controls` is what may be set.
@@ -83,6 +86,20 @@ class Session:
                 self.values[name] = before
                 notices.append(str(error))
         return notices
+
+    def trained_otherwise(self, checkpoint: str) -> str:
+        """What to tell people about a checkpoint that runs under another gait than it was trained with; else empty.
+
+        The environment, and with it what is fed forward to the legs, is that of the first checkpoint.
+        """
+        trained = from_plain(H1EnvConfig, self._policy(checkpoint).config["training"]["env"]).commands
+        here = self.env.cfg.commands
+        differ = [
+            f"{name} {getattr(trained, name)} (here {getattr(here, name)})"
+            for name in GAIT
+            if getattr(trained, name) != getattr(here, name)
+        ]
+        return f"{checkpoint} was trained with {', '.join(differ)}" if differ else ""
 
     def push(self, push: Push) -> None:
         """Push every robot's hand."""
