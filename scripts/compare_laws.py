@@ -276,9 +276,9 @@ class Properties:
     load: float = 5.0
     """Downward, on the left hand [N]."""
     wrong_length: float = 1.1
-    """Factor on the arms' links in the law's model, but not in the arms."""
+    """Factor on joint offsets and centres of mass, but for each arm's first link's, in the law's model."""
     wrong_mass: float = 1.2
-    """The same of their masses."""
+    """Factor on the masses of the same links there."""
     settle_seconds: float = 8.0
     """How long a load is left to settle [s]."""
     threads: int = 0
@@ -303,7 +303,7 @@ class Properties:
                 "softer_over_stiffer": soft / stiff,
                 "wrong_over_right_displacement": wrong / right,
                 "wrong_model_shift": float((misled - at).norm()),
-                "linearised": growth_rates(h1(), arms.left, self.stability),
+                "linearised": growth_rates(h1(), arms.built(arms.left), self.stability),
                 "energy": energy_summary(exchanged_energy(H1Env(cfg), self.stability)),
             }
             print(f"  {name}", file=sys.stderr)
@@ -363,8 +363,11 @@ class Properties:
                     f"| {name} | {key.split('_')[0]} | {least} | {e['share_drawn']:.1%} of {e['trials']} "
                     f"| {e['num_diverged']} |"
                 )
-        poses = f"{self.stability.poses} poses; a wrong model has links {self.wrong_length:g} times as long"
-        return "\n".join([*lines, "", f"{poses} and {self.wrong_mass:g} times as heavy as they are."])
+        wrong = (
+            f"a wrong model has joint offsets and centres of mass {self.wrong_length:g} times as far out and masses "
+            f"{self.wrong_mass:g} times as large as they are, but for each arm's first link; rotational inertias stay."
+        )
+        return "\n".join([*lines, "", f"{self.stability.poses} poses; {wrong}"])
 
     def draw(self, result: dict[str, Any]) -> Any:
         """Bars per law."""

@@ -22,7 +22,11 @@ def test_a_wrong_model_is_longer_and_heavier(spec):
     reach = [m.chains.pose(q).tip - m.chains.pose(q).anchors[:, :, 0] for m in (right, wrong)]
     torch.testing.assert_close(reach[1], 1.1 * reach[0])
     torch.testing.assert_close(wrong.inertias.mass[:, 1:], 1.2 * right.inertias.mass[:, 1:])
+    torch.testing.assert_close(wrong.inertias.com[:, 1:], 1.1 * right.inertias.com[:, 1:])
+    # What the first link has, and every link's inertia about its own centre of mass, are as they are.
     assert torch.equal(wrong.inertias.mass[:, 0], right.inertias.mass[:, 0])
+    assert torch.equal(wrong.inertias.com[:, 0], right.inertias.com[:, 0])
+    assert torch.equal(wrong.inertias.inertia, right.inertias.inertia)
 
 
 def small(table: str, folder: Path, *options: str) -> dict:
@@ -58,8 +62,10 @@ def test_properties_table(tmp_path):
                     "--laws", "facet")  # fmt: skip
     row = content["rows"]["facet"]
     assert 1.5 < row["softer_over_stiffer"] < 4.0  # PD's own compliance is in both
-    assert row["wrong_over_right_displacement"] != pytest.approx(1.0, abs=1e-3)
     text = (tmp_path / "properties.md").read_text()
+    published = (Path(__file__).parents[1] / "docs/laws/properties.md").read_text()
+    assert text.splitlines()[-1].partition("; ")[2] == published.splitlines()[-1].partition("; ")[2]
+    assert row["wrong_over_right_displacement"] != pytest.approx(1.0, abs=1e-3)
     assert "| yes / no / no |" in text  # the paper's
     assert "| facet | changing | " in text
 

@@ -55,6 +55,15 @@ def test_what_is_not_shipped_is_a_row_that_says_so(book, monkeypatch):
     assert sum("not shipped" in line for line in book.lines) >= 20
 
 
+def test_an_error_without_bound_is_the_largest(book, monkeypatch):
+    rows = [{"axis": "x", "error": -0.3, "n": 4}, {"axis": "y", "error": None, "n": 4},
+            {"axis": "z", "error": None, "n": 0}]  # fmt: skip
+    result = {"fidelity": rows, "num_wrong_way": 3, "coverage": 0.5, "num_falls": 1, "num_envs": 12}
+    monkeypatch.setattr(book, "run", lambda *_, **__: result)
+    rp.fidelity(book, True)
+    assert "| cotap | joint | no bound | 30% / no bound / - | 3 | 50% | 1 of 12 |" in book.lines
+
+
 def test_the_papers_tables_have_seven_rows_each():
     assert all(len(rows) == len(rp.ROWS) == 7 for rows in rp.IMPACT.values())
     assert set(rp.ROWS) <= set(rp.ARMS)

@@ -28,15 +28,6 @@ def test_matrix_from_quat(quats):
     torch.testing.assert_close(rotations.matrix_from_quat(quats), expected)
 
 
-def test_quat_multiply_composes_rotations(quats):
-    a, b = quats[:25], quats[25:]
-    product = rotations.quat_multiply(a, b)
-    expected = np.zeros(4)
-    for i in range(len(a)):
-        mujoco.mju_mulQuat(expected, a[i].numpy(), b[i].numpy())
-        torch.testing.assert_close(product[i], torch.from_numpy(expected))
-
-
 def test_quat_about_z_turns_x_towards_y():
     quarter = rotations.matrix_from_quat(rotations.quat_about_z(torch.tensor([math.pi / 2])))[0]
     torch.testing.assert_close(quarter @ torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 1.0, 0.0]))

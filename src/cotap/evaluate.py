@@ -53,8 +53,6 @@ class CommonOptions:
     plot: str = ""
     """Write a plot here (PNG)."""
     laws: tyro.conf.OmitArgPrefixes[LawOptions] = field(default_factory=LawOptions)
-    singularity_ratio: bool = True
-    """Go back to PD near singular arms (paper, equation 9). Without it, for the ablation that was trained so."""
 
 
 @dataclass
@@ -192,7 +190,6 @@ def _prepare(options: CommonOptions, protocol: Any) -> tuple[H1Env, Policy, str]
 
     protocol.check()
     upper_body = options.laws.configure()
-    upper_body.singularity_ratio = options.singularity_ratio
     for name in ("json", "plot", "video"):
         _require_folder(name, getattr(options, name, ""))
     if options.threads:
@@ -312,11 +309,12 @@ def static_stiffness(options: StaticStiffnessOptions) -> dict[str, Any]:
 def fidelity(options: FidelityOptions) -> dict[str, Any]:
     """Measure, print the table, write what was asked for, and return the result."""
     from cotap.agents.checkpoint import write_json
+    from cotap.compliance.laws import WITHOUT_STIFFNESS
     from cotap.evaluation.fidelity import measure, plot, summary, table
 
     protocol = options.protocol
     env, policy, checkpoint = _prepare(options, protocol)
-    if env.cfg.upper_body.of(protocol.hand).name in ("pd", "soft-pd"):
+    if env.cfg.upper_body.of(protocol.hand).name in WITHOUT_STIFFNESS:
         raise ValueError("fidelity needs a law with a stiffness at the hand, such as --method cotap")
     start = time.perf_counter()
     measured, coverage = measure(env, protocol, policy)
@@ -403,7 +401,8 @@ def stability(options: StabilityOptions) -> dict[str, Any]:
     protocol = options.protocol
     env, _, checkpoint = _prepare(options, protocol)
     start = time.perf_counter()
-    rates = growth_rates(env.spec, env.cfg.upper_body.left, protocol)
+    arms = env.cfg.upper_body
+    rates = growth_rates(env.spec, arms.built(arms.left), protocol)
     energy = energy_summary(exchanged_energy(env, protocol))
     result = _result("stability", options, protocol, env, checkpoint) | {
         "num_poses": protocol.poses,

@@ -56,7 +56,9 @@ def test_arms_are_led_into_a_clip_and_back_without_a_jump(make_env):
     env = make_env(num_envs=2)
     m, rng = env.motions, env.rng
     m.hold(m.default)
-    m._fixed = False
+    m.step(rng)
+    m.reset(torch.tensor([True, False]), rng)
+    assert torch.equal(m.current().position, m.default.expand(2, -1))
     clip = m.clips.names[0]
     positions = []
     for motion in (clip, REST):

@@ -92,20 +92,6 @@ def test_swings_move_the_shoulders_in_opposition(spec):
     assert float(left.abs().max()) > 0.15
 
 
-def test_hold_overrides_until_further_notice(spec, rng):
-    motion = MotionGenerator(MotionConfig(), spec, 3, 0.02)
-    motion.reset(torch.ones(3, dtype=torch.bool), rng)
-    for _ in range(30):
-        motion.step(rng)
-    pose = torch.linspace(-0.3, 0.4, 8)
-    motion.hold(pose)
-    for _ in range(200):
-        motion.step(rng)
-    motion.reset(torch.ones(3, dtype=torch.bool), rng)
-    torch.testing.assert_close(motion.current().position, pose.repeat(3, 1))
-    assert not motion.current().velocity.any()
-
-
 def test_reset_touches_only_its_worlds_and_forgets_their_past(spec):
     """What a world does after a reset depends on the random numbers only, not on the motion that was interrupted."""
     poses = []

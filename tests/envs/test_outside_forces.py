@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from cotap.envs.disturbances import HandForceConfig
+from cotap.envs.disturbances import AssistConfig, HandForceConfig
 from cotap.envs.forces import ForceProfile
 from cotap.envs.punches import PunchConfig
 from cotap.robots.ground import HALF_EXTENT_M, bumps
@@ -98,6 +98,28 @@ def test_robots_start_on_uneven_ground_at_different_places(make_env):
     low = env.state.foot_pos_w[:, :, 2].amin(1)
     assert (low.abs() < 0.03).all()
     assert float(low.std()) > 1e-3  # they stand at different heights
+
+
+def test_a_base_that_is_held_starts_where_it_is_held(make_env):
+    env = make_env(4, hand_forces=QUIET, unevenness_m=0.03, fixed_base=True)
+    start = env.sim.qpos[:, :3].clone()
+    for _ in range(10):
+        env.step(torch.zeros(4, 19))
+    torch.testing.assert_close(env.sim.qpos[:, :3], start, atol=1e-3, rtol=0)
+    assert not start[:, :2].any()
+
+
+def test_a_push_on_the_base_adds_to_the_help_of_the_gantry(make_env):
+    push = ForceProfile((50.0, -20.0, 10.0), "left", 0.0, place="base")
+    wrench = []
+    for force, help_ in ((push, True), (ForceProfile(), True), (push, False)):
+        env = make_env(3, hand_forces=QUIET, force=force, assist=AssistConfig(enabled=help_), seed=2)
+        env._apply_forces()
+        wrench.append(env.sim.xfrc[:, env._base_body].clone())
+    both, helped, pushed = wrench
+    assert helped[:, 2].abs().min() > 1.0
+    assert pushed[:, :3].norm(dim=1).min() > 50.0
+    torch.testing.assert_close(both, helped + pushed)
 
 
 def test_ground_is_flat_unless_asked(make_env):

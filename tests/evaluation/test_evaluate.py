@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from cotap.agents.checkpoint import load_checkpoint, save_checkpoint, sha256
+from cotap.configs import to_plain
 from cotap.evaluate import main
 from cotap.evaluation.policy import load_policy, shipped_checkpoint, shipped_names
 from cotap.evaluation.render import RenderingUnavailable, open_renderer
@@ -101,6 +102,15 @@ def test_bad_input_is_named(options: list[str], says: str, capsys: pytest.Captur
 def test_plot_is_written(tmp_path: Path):
     run(tmp_path, "--num-envs", "4", "--episode-seconds", "6", "--plot", str(tmp_path / "plot.png"))
     assert (tmp_path / "plot.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_the_video_is_of_the_laws_that_were_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    filmed = []
+    monkeypatch.setattr("cotap.evaluation.render.tour_video", lambda _path, cfg, *_: filmed.append(cfg.upper_body))
+    options = ("--num-envs", "2", "--episode-seconds", "5", "--method", "cotap", "--no-singularity-ratio")
+    result = run(tmp_path, *options, "--video", str(tmp_path / "tour.mp4"))
+    assert to_plain(filmed[0]) == result["settings"]["env"]["upper_body"]
+    assert not filmed[0].singularity_ratio
 
 
 def test_without_a_renderer_the_message_says_what_to_do(monkeypatch: pytest.MonkeyPatch):

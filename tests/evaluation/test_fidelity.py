@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
 import torch
 
 from cotap.envs import H1Env, H1EnvConfig
 from cotap.evaluate import main
-from cotap.evaluation.fidelity import Fidelity, FidelityResult, conditions, measure, shipped_poses, summary, table
+from cotap.evaluation.fidelity import Fidelity, FidelityResult, conditions, measure, plot, shipped_poses, summary, table
 from cotap.evaluation.law_options import LawOptions
 
 
@@ -31,13 +33,37 @@ def test_errors_by_hand():
     assert out["largest_error"] == pytest.approx(1.0)
     assert out["metrics"]["stiffness_error"]["mean"] == pytest.approx(2.0 / 5.0)
     assert out["num_saturated"] == 1
+    assert out["num_wrong_way"] == 0
+    assert out["error_quantiles"] == {"50": 0.0, "95": pytest.approx(1.0)}
     out = summary(result(unholdable=torch.tensor([False, False, True, True, False, False])), 0.8,
                   Fidelity(stiffness_levels=(200.0,)))  # fmt: skip
     assert out["fidelity"][1]["error"] is None
-    assert out["fidelity"][1]["reason"]
+    assert out["fidelity"][1]["reason"] == "no world was counted"
+    assert out["largest_error"] == 0.0  # of what was measured
     assert out["num_unholdable"] == 2
     content = out | {"num_falls": 1, "num_envs": 6, "method": "cotap"}
     assert "| y | 200 | - |" in table(content)
+
+
+def test_hands_that_go_against_the_load_are_counted_and_shown(tmp_path):
+    """One of two hands along x goes the wrong way, both along y do not move on the mean, z is as it was."""
+    way = torch.tensor([1.5, -0.5, 0.5, -0.5, 1.0, 9.0])
+    out = summary(result(way=way), 0.8, Fidelity(stiffness_levels=(200.0,)))
+    assert out["num_wrong_way"] == 2
+    assert [row["wrong_way"] for row in out["fidelity"]] == [1, 1, 0]
+    assert [row["error"] for row in out["fidelity"]][:2] == [None, None]
+    assert out["largest_error"] is None
+    mean = out["metrics"]["stiffness_error"]
+    assert (mean["mean"], mean["n"]) == (None, 3)
+    assert mean["reason"].startswith("2 of 5 hands")
+    # Errors 0, 1/3, 1 and two without bound.
+    assert out["error_quantiles"] == {"50": pytest.approx(1.0), "95": None}
+    content = out | {"num_falls": 1, "num_envs": 6, "method": "cotap"}
+    json.dumps(content, allow_nan=False)
+    assert "| x | 200 | - | the hand did not go where the load is | 2 | 1 |" in table(content)
+    assert "2 hands did not go where the load is" in table(content)
+    plot(tmp_path / "plot.png", content)
+    assert (tmp_path / "plot.png").stat().st_size > 5000
 
 
 def test_condition_numbers_are_those_of_mujocos_jacobian(model, spec):

@@ -99,6 +99,16 @@ def test_errors_are_taken_only_once_a_command_has_settled():
     assert ok[:, 0].nonzero().squeeze(1).tolist() == [*range(50, 100), *range(150, 200)]
 
 
+def test_the_lag_behind_a_height_that_moves_is_measured():
+    """0.2 m down in 40 steps, followed five steps late; velocity and stand hold all the while."""
+    t = trajectory(worlds=1)
+    ramp = 1.0 - 0.005 * torch.arange(-100, 100).clamp(0, 40)
+    t.height_command[:, 0] = ramp
+    t.height[5:, 0] = ramp[:-5]
+    # Each of the 40 steps of 5 mm is made up for five steps later; 150 of 200 steps are measured.
+    assert tracking_measures(t, 0.8)["e_height"][0] == pytest.approx(40 * 0.005 * 5 / 150, rel=1e-3)
+
+
 def test_measures_end_with_the_fall_and_never_include_what_follows():
     t = trajectory()
     t.fell[120, 0] = True

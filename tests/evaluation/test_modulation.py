@@ -48,6 +48,7 @@ def test_every_arm_goes_through_the_whole_range():
 @pytest.mark.parametrize(
     ("options", "message"),
     [(["--change", "leap"], "change 'leap' is unknown"), (["--method", "pd"], "needs a law with a stiffness"),
+     (["--method", "soft-pd"], "got soft-pd, soft-pd"), (["--left", "pd", "--right", "soft-pd"], "got pd, soft-pd"),
      (["--stiffness-range", "0", "5"], "stiffness_range[0]"), (["--alpha-range", "0", "2"], "alpha_range[1]")],
 )  # fmt: skip
 def test_bad_options_are_named(options, message, capsys):

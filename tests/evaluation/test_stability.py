@@ -135,6 +135,20 @@ def test_the_command_prints_and_writes(tmp_path, capsys):
     assert "largest real part" in capsys.readouterr().out
 
 
+def test_without_the_ratio_both_halves_are_without_it(spec, tmp_path):
+    """Poses beyond a condition number of 2 are most: the ratio and its absence make different loops."""
+    law = "cotap:condition_threshold=2"
+    arguments = ["stability", "--left", law, "--right", law, "--no-singularity-ratio", "--poses", "8", "--num-envs",
+                 "2", "--seconds", "0.1", "--settle-seconds", "0.1", "--threads", "1", "--json"]  # fmt: skip
+    assert main([*arguments, str(tmp_path / "out.json")]) == 0
+    content = json.loads((tmp_path / "out.json").read_text())
+    left = LawConfig("cotap", null_stiffness=25.0, condition_threshold=2.0)
+    never = replace(left, condition_threshold=math.inf)
+    assert content["linearised"] == growth_rates(spec, never, Stability(poses=8))
+    assert content["linearised"] != growth_rates(spec, left, Stability(poses=8))
+    assert not content["settings"]["env"]["upper_body"]["singularity_ratio"]
+
+
 @pytest.mark.parametrize(
     ("option", "message"),
     [("--poses=0", "poses"), ("--walls=-1", "walls[0]"), ("--num-envs=1", "num_envs"), ("--force=0", "force"),

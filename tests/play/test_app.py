@@ -7,6 +7,7 @@ import socket
 import numpy as np
 import pytest
 
+from cotap.evaluation.policy import shipped_checkpoint
 from cotap.evaluation.recording import load_recording
 from cotap.play.__main__ import main
 from cotap.play.app import App
@@ -15,6 +16,7 @@ from cotap.play.forces import Push
 from cotap.play.mailbox import Record, Reset, Step
 from cotap.play.plots import Plots, force_displacement
 from cotap.play.server import PortTaken, open_server
+from cotap.play.session import Session
 
 
 @pytest.fixture
@@ -80,10 +82,57 @@ def test_a_recording_holds_what_was_shown_and_a_change_of_robots_ends_it(app):
     assert app.archive.path.name == "recording_002.npz"
 
 
+def test_a_recording_logs_what_came_into_force_pauses_included(app):
+    app.mailbox.set("a.left.alpha", 0.75)
+    app.mailbox.ask(Record(True))
+    app.advance()
+    app.mailbox.set("paused", True)
+    app.mailbox.set("a.left.stiffness_x", 600.0)
+    app.advance()
+    app.mailbox.set("a.left.stiffness_x", 700.0)
+    app.mailbox.set("a.checkpoint", "missing")  # cannot be read: not in force
+    app.advance()
+    app.mailbox.set("paused", False)
+    app.advance()
+    app.mailbox.set("stand", False)
+    app.advance()
+    app.mailbox.ask(Record(False))
+    app.advance()
+    settings = load_recording(app.archive.path).settings
+    assert settings["values"]["a.left.alpha"] == 0.75
+    assert settings["values"]["a.left.stiffness_x"] == 300.0
+    dt = app.session.dt
+    assert settings["changes"] == [
+        {"time": dt, "values": {"a.left.stiffness_x": 700.0, "paused": False}},
+        {"time": 2 * dt, "values": {"stand": False}},
+    ]
+
+
 def test_a_checkpoint_that_is_refused_is_shown_as_it_was(app):
     app.mailbox.set("a.checkpoint", "missing")
     app.advance()
     assert app.panel._handles["a.checkpoint"].value == "base"
+
+
+def test_a_policy_that_was_trained_with_another_gait_runs_and_says_so(free_port, tmp_path, monkeypatch):
+    server = open_server("127.0.0.1", free_port)
+    try:
+        app = App(server, Session({name: shipped_checkpoint(name) for name in ("cotap", "base")}), tmp_path)
+        told = []
+        monkeypatch.setattr(app.notices, "tell", lambda text, title: told.append((title, text)))
+        app.advance()
+        assert told == []
+        app.mailbox.set("b.checkpoint", "base")
+        app.advance()
+        app.mailbox.set("b.checkpoint", "cotap")  # what the environment is made of
+        app.advance()
+    finally:
+        server.stop()
+    ((title, text),) = told
+    assert title == "robot B: another gait"
+    differ = ("step_apart_m 0.0 (here 0.04)", "step_clear_m 0.0 (here 0.15)", "step_timing False (here True)")
+    assert text == f"base was trained with {', '.join(differ)}"
+    assert app.session.num_steps == 3
 
 
 def test_no_browser_is_asked_for_an_environment_map_and_for_shadows_only_when_they_are_wanted(app):

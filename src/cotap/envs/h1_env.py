@@ -87,7 +87,8 @@ class H1EnvConfig:
     fixed_base: bool = False
     """Hold the base in the air: for measurements on the arms alone."""
     unevenness_m: float = 0.0
-    """Height of the ground's bumps from lowest to highest [m]; 0 is flat. Worlds start at different places on it."""
+    """Height of the ground's bumps from lowest to highest [m]; 0 is flat. Worlds start at different places on it
+    unless their base is held."""
     actions: ActionConfig = field(default_factory=ActionConfig)
     upper_body: UpperBodyConfig = field(default_factory=UpperBodyConfig)
     observations: ObservationConfig = field(default_factory=ObservationConfig)
@@ -513,7 +514,10 @@ class H1Env(VecEnv):
                 rotate(s.torso_rotation_w, s.torso_angular_velocity_t), rotate(s.heading_w, error_h)[:, :2],
                 command.yaw_rate - s.yaw_rate, command.height - s.height, s.torso_linear_velocity_h[:, 2],
             )  # fmt: skip
-            self.sim.xfrc[:, self._base_body] = share * torch.cat((force, torque), 1).double()
+            wrench = share * torch.cat((force, torque), 1).double()
+            if self.scripted.active:
+                wrench[:, :3] += self.sim.xfrc[:, self._base_body, :3]
+            self.sim.xfrc[:, self._base_body] = wrench
 
     def _punch(self) -> None:
         """Add the blows on the arms' joints to what acts on the links already."""
@@ -664,7 +668,7 @@ class H1Env(VecEnv):
         joints[:, self.num_lower :] = self.motions.current().position[mask]
         position = torch.zeros(n, 3, device=self.device)
         position[:, 2] = self.spec.nominal_height_m + (FIXED_BASE_LIFT_M if self.cfg.fixed_base else 0.01)
-        if self.cfg.unevenness_m > 0.0:
+        if self.cfg.unevenness_m > 0.0 and not self.cfg.fixed_base:
             position[:, :2] = uniform(self.rng, -0.5 * HALF_EXTENT_M, 0.5 * HALF_EXTENT_M, n, 2)
             position[:, 2] += 0.5 * self.cfg.unevenness_m
         yaw = uniform(self.rng, -math.pi, math.pi, n) * (not self.cfg.fixed_base)

@@ -83,19 +83,11 @@ class MotionGenerator(Stateful):
         self._amplitude = torch.zeros(n, u)
         self._cycles, self._out_and_back = torch.zeros(n), torch.zeros(n)
         self._duration_s, self._time_s = torch.ones(n), torch.zeros(n)
-        self._fixed = False
-
-    def hold(self, pose: torch.Tensor) -> None:
-        """Hold `pose` (U,) or (N, U) in all worlds until further notice."""
-        self._start = pose.to(self._start.device).expand_as(self._start).clone()
-        self._goal = self._start.clone()
-        self._amplitude.zero_()
-        self._fixed = True
 
     def reset(self, mask: torch.Tensor, rng: torch.Generator) -> None:
         """Start the worlds of `mask` at a random pose with a random segment."""
         n = int(mask.sum())
-        if n == 0 or self._fixed:
+        if n == 0:
             return
         near = 0.5 * uniform(rng, -1.0, 1.0, n, self.default.shape[0])
         span = torch.where(near < 0.0, self.default - self._low, self._high - self.default)
@@ -106,8 +98,7 @@ class MotionGenerator(Stateful):
     def step(self, rng: torch.Generator) -> None:
         """Advance by one control step; worlds whose segment has ended draw the next."""
         self._time_s = self._time_s + self._dt
-        if not self._fixed:
-            self._draw(self._time_s >= self._duration_s, rng)
+        self._draw(self._time_s >= self._duration_s, rng)
 
     def current(self) -> ArmReference:
         """The reference now."""

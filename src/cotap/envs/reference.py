@@ -115,13 +115,14 @@ class ReferenceMotion(Stateful):
         self._led: str | None = None
 
     def lead(self, motion: str) -> None:
-        """Take all worlds from where their arms are into `motion`, until further notice: a clip's name, from its
-        beginning and over again, or `REST`, the default pose.
+        """Take all worlds from where their arms are, held or not, into `motion`, until further notice: a clip's name,
+        from its beginning and over again, or `REST`, the default pose.
 
         Raises:
             ValueError: no clip is called so, or clips are switched off.
         """
         self._led = require_one_of("motion", motion, (REST, *(self.clips.names if self.clips else ())))
+        self._fixed = False
         everyone = torch.ones_like(self._from_clip)
         self._begin(everyone, motion)
         self._blend(everyone, self._raw().position)

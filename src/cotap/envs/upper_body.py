@@ -88,6 +88,10 @@ class UpperBodyConfig:
         """The law of the arm on `side`."""
         return {"left": self.left, "right": self.right}[side]
 
+    def built(self, law: LawConfig) -> LawConfig:
+        """`law` as it is built here: without the ratio, no arm is near enough to singular to give way."""
+        return law if self.singularity_ratio else replace(law, condition_threshold=math.inf)
+
 
 class UpperBody(Stateful):
     """Asks each arm's law once a control step and gives its torque at every physics step.
@@ -286,8 +290,7 @@ class UpperBody(Stateful):
         kind = law.kind()
         if kind not in self._laws:
             nobody = torch.zeros(self._shape[:2], dtype=torch.bool, device=self.arms.kp.device)
-            built = law if self._cfg.singularity_ratio else replace(law, condition_threshold=math.inf)
-            self._laws[kind] = (LAWS[law.name](self.arms, built), law, nobody)
+            self._laws[kind] = (LAWS[law.name](self.arms, self._cfg.built(law)), law, nobody)
         return self._laws[kind][2]
 
     def _ask(self, arms: ArmState) -> tuple[TorqueLaw, dict[str, torch.Tensor]]:

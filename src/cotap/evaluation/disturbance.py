@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from cotap.checks import require_range
+from cotap.compliance.laws import WITHOUT_STIFFNESS
 from cotap.envs import H1Env, H1EnvConfig
 from cotap.envs.forces import ForceProfile
 from cotap.evaluation.metrics import masked_mean, summaries
@@ -64,8 +65,9 @@ class Impact(Scenario):
 
     def configure(self, env: H1EnvConfig) -> H1EnvConfig:
         """Turn the environment that a policy was trained in into this protocol's. Changes and returns `env`."""
+        super().configure(env)
         env.force = self._profile()
-        return super().configure(env)
+        return env
 
     def hit(self, env: H1Env) -> list[int]:
         """Indices of the hands whose error is `e_ee_hit`: those that the force is on, all for a force on the base."""
@@ -101,7 +103,7 @@ class Impact(Scenario):
     def _stiffness(self, env: H1Env, measures: dict[str, torch.Tensor], stood: torch.Tensor) -> dict[str, Any]:
         """Force over displacement, where the load is held and is the same in all worlds."""
         law = env.cfg.upper_body.of(env.spec.arms[self.hit(env)[0]].side)
-        commanded = list(law.stiffness) if law.name not in ("pd", "soft-pd") else None
+        commanded = list(law.stiffness) if law.name not in WITHOUT_STIFFNESS else None
         reason = ""
         if self.place != "hand" or not any(self.force):
             reason = "no hand is loaded"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from cotap.envs import H1Env, H1EnvConfig
 from cotap.envs.commands import STEADY_RAD
 from cotap.envs.reference import ClipConfig, load_clips
 from cotap.evaluation.metrics import summarize
+from cotap.evaluation.quiet import quiet
 from cotap.evaluation.report import save_figure
 from cotap.evaluation.rollout import PolicyFunction
 from cotap.evaluation.scenario import PELVIS
@@ -73,11 +75,10 @@ class Fidelity:
     def configure(self, env: H1EnvConfig) -> H1EnvConfig:
         """Turn an environment into this protocol's. Changes and returns `env`."""
         self.check()
+        quiet(env)
         env.num_envs, env.seed, env.torque_limit_scale = self.num_envs, self.seed, self.torque_limit_scale
-        env.assist.enabled = env.hand_forces.enabled = env.blows.enabled = env.randomization.enabled = False
-        env.observations.noise.enabled = False
         env.fixed_base = self.pelvis == "fixed"
-        env.motions.clips.share, env.impedance.share = 0.0, 0.0
+        env.motions.clips.share = 0.0
         env.terminations.episode_s = 1e6
         env.commands.steady_rad = STEADY_RAD
         env.commands.stand_probability, env.commands.height_offset = 1.0, (0.0, 0.0)
@@ -165,52 +166,83 @@ def _torque_share(env: H1Env, pose: torch.Tensor, side: int, force: torch.Tensor
 
 
 def summary(result: FidelityResult, coverage: float, protocol: Fidelity) -> dict[str, Any]:
-    """The measured part of the evaluation's JSON. Errors are of the felt stiffness, as shares of the commanded one."""
+    """The measured part of the evaluation's JSON. Errors are of the felt stiffness, as shares of the commanded one.
+
+    A hand that did not go where the load is has an error without bound: such hands are `num_wrong_way`, and what they
+    leave without a bound, a mean, a quantile or `largest_error`, is null.
+    """
     rows = []
     for axis, name in enumerate("xyz"):
         for level in protocol.stiffness_levels:
             mine = result.counted & (result.axis == axis) & (result.stiffness == level)
             rows.append({"axis": name, "stiffness": level, **_error(result.way[mine], protocol.seed)})
     way = result.way[result.counted]
-    error = (1.0 / way[way > 0.0] - 1.0).abs()
-    worst = [abs(row["error"]) for row in rows if row["error"] is not None]
+    wrong = way <= 0.0
+    # No stiffness, however large, moves a hand against its load: the error of one that went so has no bound.
+    error = torch.where(wrong, math.inf, (1.0 / way - 1.0).abs())
+    measured = [row for row in rows if row["n"] > 0]
+    bounded = [abs(row["error"]) for row in measured if row["error"] is not None]
     return {
         "coverage": coverage,
         "num_unholdable": int(result.unholdable.sum()),
         "num_saturated": int((result.saturated & result.counted).sum()),
+        "num_wrong_way": int(wrong.sum()),
         "fidelity": rows,
-        "largest_error": max(worst) if worst else None,
-        "metrics": {"stiffness_error": summarize(error, protocol.seed)},
+        "largest_error": max(bounded) if measured and len(bounded) == len(measured) else None,
+        "metrics": {"stiffness_error": _mean_error(error, protocol.seed)},
         "error_quantiles": _quantiles(error),
     }
 
 
-def _quantiles(error: torch.Tensor) -> dict[str, float] | None:
-    """Median and 95th percentile; None of nothing."""
+def _mean_error(error: torch.Tensor, seed: int) -> dict[str, Any]:
+    """As `summarize`; no mean where an error has no bound, and `n` of those that have one."""
+    bounded = torch.isfinite(error)
+    if bounded.all():
+        return summarize(error, seed)
+    n = int(bounded.sum())
+    reason = f"{len(error) - n} of {len(error)} hands did not go where the load is: their error has no bound"
+    return {"mean": None, "std": None, "ci95": None, "n": n, "reason": reason}
+
+
+def _quantiles(error: torch.Tensor) -> dict[str, float | None] | None:
+    """Median and 95th percentile, null where that is an error without bound; None of nothing."""
     if len(error) == 0:
         return None
-    return {"50": float(error.quantile(0.5)), "95": float(error.quantile(0.95))}
+    between = "linear" if torch.isfinite(error).all() else "higher"  # nothing lies between a number and infinity
+    values = {name: float(error.quantile(q, interpolation=between)) for name, q in (("50", 0.5), ("95", 0.95))}
+    return {name: value if math.isfinite(value) else None for name, value in values.items()}
 
 
 def _error(way: torch.Tensor, seed: int) -> dict[str, Any]:
-    """Error of the stiffness that the mean displacement over poses amounts to, with its interval."""
+    """Error of the stiffness that the mean displacement over poses amounts to, with its interval.
+
+    `wrong_way` of the `n` hands did not go where the load is; they count in the mean with the way that they went.
+    """
     mean = summarize(way, seed)
-    if mean["mean"] is None or mean["ci95"][0] <= 0.0:
-        return {"error": None, "ci95": None, "n": mean["n"], "reason": "the hand did not go where the load is"}
+    count = {"n": mean["n"], "wrong_way": int((way <= 0.0).sum())}
+    if mean["mean"] is None:
+        return {"error": None, "ci95": None, **count, "reason": "no world was counted"}
+    if mean["ci95"][0] <= 0.0:
+        return {"error": None, "ci95": None, **count, "reason": "the hand did not go where the load is"}
     low, high = mean["ci95"]
-    return {"error": 1.0 / mean["mean"] - 1.0, "ci95": [1.0 / high - 1.0, 1.0 / low - 1.0], "n": mean["n"]}
+    return {"error": 1.0 / mean["mean"] - 1.0, "ci95": [1.0 / high - 1.0, 1.0 / low - 1.0], **count}
 
 
 def table(content: dict[str, Any]) -> str:
     """Errors by axis and stiffness, as Markdown."""
-    lines = ["| axis | commanded [N/m] | error | 95 % interval | poses |", "|---|---|---|---|---|"]
+    lines = [
+        "| axis | commanded [N/m] | error | 95 % interval | poses | of them the wrong way |",
+        "|---|---|---|---|---|---|",
+    ]
     for row in content["fidelity"]:
         error, interval = "-", row.get("reason", "")
         if row["error"] is not None:
             error, interval = f"{row['error']:+.1%}", "{:+.1%} to {:+.1%}".format(*row["ci95"])
-        lines.append(f"| {row['axis']} | {row['stiffness']:g} | {error} | {interval} | {row['n']} |")
+        counts = f"{row['n']} | {row['wrong_way']}"
+        lines.append(f"| {row['axis']} | {row['stiffness']:g} | {error} | {interval} | {counts} |")
     notes = [
         f"{content['num_falls']} of {content['num_envs']} worlds fell",
+        f"{content['num_wrong_way']} hands did not go where the load is",
         f"{content['num_unholdable']} loads beyond the arm's torque",
         f"poses cover {content['coverage']:.0%} of the shipped motion's time",
     ]
@@ -218,7 +250,7 @@ def table(content: dict[str, Any]) -> str:
 
 
 def plot(path: Path, content: dict[str, Any]) -> None:
-    """Error against commanded stiffness, axis by axis."""
+    """Error against commanded stiffness, axis by axis; a cross on the upper edge for one without bound."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -230,6 +262,8 @@ def plot(path: Path, content: dict[str, Any]) -> None:
         error = [100.0 * r["error"] for r in rows]
         spread = [[100.0 * abs(r["error"] - r["ci95"][k]) for r in rows] for k in (0, 1)]
         axis.errorbar([r["stiffness"] for r in rows], error, spread, fmt="o-", color=color, ms=3, capsize=2, label=name)
+        boundless = [r["stiffness"] for r in content["fidelity"] if r["axis"] == name and r["error"] is None and r["n"]]
+        axis.plot(boundless, [1.0] * len(boundless), "x", color=color, transform=axis.get_xaxis_transform())
     axis.axhline(0.0, color="0.4", lw=0.8)
     axis.set(xscale="log", xlabel="commanded stiffness [N/m]", ylabel="error of the felt stiffness [%]")
     axis.grid(alpha=0.2)

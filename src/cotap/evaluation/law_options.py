@@ -40,6 +40,8 @@ class LawOptions:
     """A law for the left arm alone, such as cotap:alpha=0.7,stiffness=500."""
     right: str = ""
     """A law for the right arm alone."""
+    singularity_ratio: bool = True
+    """Go back to PD near singular arms (paper, equation 9). Without it, for the ablation that was trained so."""
 
     def configure(self) -> UpperBodyConfig:
         """The config of the arms. Raises ValueError naming what is wrong."""
@@ -50,7 +52,7 @@ class LawOptions:
             parse_law("left", self.left, common) if self.left else common,
             parse_law("right", self.right, common) if self.right else replace(common),
         )
-        out.torso.model = self.torso_compliance
+        out.torso.model, out.singularity_ratio = self.torso_compliance, self.singularity_ratio
         out.check()
         return out
 

@@ -70,7 +70,9 @@ def tracking_measures(t: Trajectory, gait_period_s: float, settle_s: float = 1.0
     """Velocity-tracking measures per world, (N,) each; NaN where a world has nothing to measure.
 
     Errors are taken once a command has held for `settle_s`; `_gait` errors use velocities averaged over the last gait
-    period, all of it after the command's change.
+    period, all of it after the command's change. A command is of velocity and standing: a height that changes while
+    both hold, as from one stance to another, moves at `commands.height_rate` within what is measured, and how far the
+    torso lags behind it is in `e_height`.
     """
     period = round(gait_period_s / t.dt)
     ok = settled(t, settle_s)

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from cotap.checks import require_interval, require_one_of, require_range
+from cotap.compliance.laws import WITHOUT_STIFFNESS
 from cotap.envs import H1Env
 from cotap.evaluation.disturbance import ConstantLoad, window_measures
 from cotap.evaluation.metrics import summaries
@@ -51,8 +52,9 @@ class Modulation(ConstantLoad):
     def prepare(self, env: H1Env) -> None:
         """Draw where in the cycle every world and arm begins."""
         super().prepare(env)
-        if not env.upper_body.active:
-            raise ValueError("modulation needs a law with a stiffness, such as --method cotap; got pd on both arms")
+        laws = [env.cfg.upper_body.of(arm.side).name for arm in env.spec.arms]
+        if all(law in WITHOUT_STIFFNESS for law in laws):
+            raise ValueError(f"modulation needs a law with a stiffness, such as --method cotap; got {', '.join(laws)}")
         rng = torch.Generator().manual_seed(self.seed)
         self.phase = torch.rand(env.num_envs, len(env.spec.arms), 2, generator=rng).to(env.device)
 

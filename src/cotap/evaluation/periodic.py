@@ -51,8 +51,9 @@ class PeriodicLoad(Scenario):
 
     def configure(self, env: H1EnvConfig) -> H1EnvConfig:
         """Turn the environment that a policy was trained in into this protocol's. Changes and returns `env`."""
+        super().configure(env)
         env.force = ForceProfile(self.force, self.hand, self.onset, self.seconds, self.period)
-        return super().configure(env)
+        return env
 
     def measure(self, trajectory: Trajectory, env: H1Env) -> dict[str, Any]:
         """The measured part of the evaluation's JSON."""

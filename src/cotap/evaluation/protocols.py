@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from cotap.checks import require_one_of, require_positive_int, require_range
 from cotap.envs import H1EnvConfig
 from cotap.envs.commands import STEADY_RAD
+from cotap.evaluation.quiet import quiet
 from cotap.robots.mjcf import COLLISIONS
 
 
@@ -71,10 +72,9 @@ class VelocityTracking:
     def configure(self, env: H1EnvConfig) -> H1EnvConfig:
         """Turn the environment that a policy was trained in into this protocol's. Changes and returns `env`."""
         self.check()
+        quiet(env)
         env.num_envs, env.seed, env.torque_limit_scale = self.num_envs, self.seed, self.torque_limit_scale
         env.collision = self.collision or env.collision
-        env.assist.enabled = env.blows.enabled = False
-        env.observations.noise.enabled = False
         env.randomization.enabled = self.randomize
         # Episodes outlast the evaluation: what ends one is a fall.
         env.terminations.episode_s = 2.0 * self.episode_seconds

@@ -65,8 +65,9 @@ class PunchWalk(Scenario):
 
     def configure(self, env: H1EnvConfig) -> H1EnvConfig:
         """Turn the environment that a policy was trained in into this protocol's. Changes and returns `env`."""
+        super().configure(env)
         env.punches = self._punches()
-        return super().configure(env)
+        return env
 
     def prepare(self, env: H1Env) -> None:
         """Lay out the waypoints."""

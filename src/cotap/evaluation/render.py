@@ -15,6 +15,7 @@ import torch
 from cotap.agents.actors import as_dict
 from cotap.envs import H1Env, H1EnvConfig
 from cotap.envs.commands import STEADY_RAD
+from cotap.evaluation.quiet import quiet
 from cotap.evaluation.rollout import PolicyFunction
 from cotap.files import write_atomically
 from cotap.robots import RobotSpec
@@ -156,8 +157,8 @@ def contact_sheet(path: Path, frames: list[np.ndarray], columns: int) -> None:
 
 def record_tour(cfg: H1EnvConfig, policy: PolicyFunction, seed: int = 0) -> tuple[H1Env, torch.Tensor]:
     """One nominal robot on the tour. Returns the environment and its `qpos` (T, nq) at every control step."""
+    quiet(cfg)
     cfg.num_envs, cfg.seed, cfg.backend = 1, seed, "mjbatch"
-    cfg.randomization.enabled = cfg.hand_forces.enabled = cfg.blows.enabled = cfg.assist.enabled = False
     cfg.terminations.episode_s, cfg.commands.steady_rad = 1e4, STEADY_RAD
     env = H1Env(cfg)
     rows: list[torch.Tensor] = []

@@ -13,6 +13,7 @@ import torch
 from cotap.checks import require_one_of, require_positive_int, require_range
 from cotap.envs import H1Env, H1EnvConfig
 from cotap.envs.commands import STEADY_RAD
+from cotap.evaluation.quiet import quiet
 from cotap.evaluation.rollout import Trajectory
 
 MODES = ("stance", "walking")
@@ -72,12 +73,12 @@ class Scenario(ABC):
     def configure(self, env: H1EnvConfig) -> H1EnvConfig:
         """Turn the environment that a policy was trained in into this protocol's. Changes and returns `env`."""
         self.check()
+        quiet(env)
         env.num_envs, env.seed, env.torque_limit_scale = self.num_envs, self.seed, self.torque_limit_scale
         env.fixed_base, env.unevenness_m = self.pelvis == "fixed", self.unevenness
-        env.assist.enabled = env.hand_forces.enabled = env.blows.enabled = env.observations.noise.enabled = False
         env.randomization.enabled = self.randomize
         env.terminations.episode_s = 1e6
-        env.impedance.share, env.commands.steady_rad = 0.0, self.steady_rad
+        env.commands.steady_rad = self.steady_rad
         clips = env.motions.clips
         if not self.motion:
             clips.share, clips.only = 0.0, ()

@@ -15,6 +15,7 @@ from cotap.compliance.laws import LAWS, LawConfig
 from cotap.envs import H1Env, H1EnvConfig
 from cotap.envs.persistence import uniform
 from cotap.evaluation.linearization import linearize
+from cotap.evaluation.quiet import quiet
 from cotap.evaluation.report import save_figure
 from cotap.robots import RobotSpec
 from cotap.robots.chains import arm_model
@@ -69,12 +70,10 @@ class Stability:
     def configure(self, env: H1EnvConfig) -> H1EnvConfig:
         """Turn an environment into that of the trials of energy. Changes and returns `env`."""
         self.check()
+        quiet(env)
         env.num_envs, env.seed, env.fixed_base = self.num_envs, self.seed, True
-        env.assist.enabled = env.hand_forces.enabled = env.blows.enabled = env.randomization.enabled = False
-        env.observations.noise.enabled = False
         env.motions.clips.share = 0.0
         env.terminations.episode_s = 1e6
-        env.force.force = (0.0, 0.0, 0.0)
         return env
 
 

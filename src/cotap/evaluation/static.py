@@ -14,6 +14,7 @@ from cotap.checks import require_finite, require_one_of, require_positive_int, r
 from cotap.compliance import condition_number
 from cotap.envs import H1Env, H1EnvConfig
 from cotap.envs.commands import STEADY_RAD
+from cotap.evaluation.quiet import quiet
 from cotap.evaluation.report import save_figure
 from cotap.evaluation.rollout import PolicyFunction, idle
 from cotap.evaluation.scenario import PELVIS, mirrored_pose
@@ -67,9 +68,8 @@ class StaticStiffness:
     def configure(self, env: H1EnvConfig) -> H1EnvConfig:
         """Turn an environment into this protocol's. Changes and returns `env`."""
         self.check()
+        quiet(env)
         env.num_envs, env.seed, env.torque_limit_scale = self.num_envs, self.seed, self.torque_limit_scale
-        env.assist.enabled = env.hand_forces.enabled = env.blows.enabled = env.randomization.enabled = False
-        env.observations.noise.enabled = False
         env.fixed_base = self.pelvis == "fixed"
         env.motions.clips.share = 0.0
         env.terminations.episode_s = 1e6

@@ -14,7 +14,12 @@ from cotap.robots.chains import arm_chains
 
 
 def misjudged_arms(spec: RobotSpec, length: float, mass: float) -> RobotSpec:
-    """A robot whose arms' links are longer and heavier by these factors than those of `spec`."""
+    """A robot whose arms are longer and heavier by these factors than those of `spec`.
+
+    Longer: where each link, but the first of an arm, begins on the one before it, where its centre of mass is, and
+    where the hand is. Heavier: the masses of the same links. The first link keeps its place on the torso, its mass and
+    its centre of mass, and all links keep their rotational inertias about their centres of mass.
+    """
     links = {b.name for arm in spec.arms for b in spec.chain(arm.hand_body, spec.torso_body)[1:]}
     bodies = tuple(
         replace(b, pos=_scaled(b.pos, length), com=_scaled(b.com, length), mass_kg=mass * b.mass_kg)
@@ -45,7 +50,7 @@ class MisjudgingUpperBody(UpperBody):
 
 
 def misjudge(env: H1Env, length: float, mass: float) -> None:
-    """From now on the laws of `env` take the arms for longer and heavier by these factors than they are."""
+    """From now on the laws of `env` take the arms for longer and heavier by these factors, see `misjudged_arms`."""
     believed = misjudged_arms(env.spec, length, mass)
     with torch.device(env.device):
         env.upper_body = MisjudgingUpperBody(env.cfg.upper_body, believed, env.num_envs, env.dt)

@@ -43,6 +43,7 @@ class App:
         self._stop = threading.Event()
         self._failure: BaseException | None = None
         self._recorder: Recorder | None = None
+        self._changes: dict[str, Any] = {}
         self._latest: tuple[int, Sample] | None = None
         with server.atomic():
             self.scene = Scene(server, session.env.spec, len(ROBOTS))
@@ -69,11 +70,18 @@ class App:
     def advance(self) -> None:
         """One turn of the simulation's loop: take the mail, then step, or wait where there is nothing to do."""
         values, requests = self.mailbox.take()
+        before = dict(self.session.values)
         notices = self.session.set(values)
+        changes = {name: value for name, value in self.session.values.items() if value != before[name]}
+        self._changes |= changes
         if notices:
             self.panel.put_back({name: self.session.values[name] for name in values if name in self.session.values})
         for notice in notices:
             self.notices.tell(notice, title="not possible")
+        for robot in ROBOTS:
+            checkpoint = changes.get(f"{robot}.checkpoint")
+            if checkpoint and (text := self.session.trained_otherwise(checkpoint)):
+                self.notices.tell(text, title=f"robot {robot.upper()}: another gait")
         if "side_by_side" in values:
             self._keep_recording()
         step = False
@@ -91,10 +99,10 @@ class App:
         if (self.session.values["paused"] and not step) or self.archive.filming.is_set():
             self.pace.rest()
             return
-        self._step(values)
+        self._step()
         self.pace.wait(self.session.values["speed"])
 
-    def _step(self, changes: dict[str, Any]) -> None:
+    def _step(self) -> None:
         session = self.session
         falls = list(session.falls)
         sample = session.step()
@@ -103,6 +111,7 @@ class App:
         for i in range(self._shown()):
             if session.falls[i] > falls[i]:
                 self.notices.tell(f"robot {ROBOTS[i].upper()} fell and is back on its feet", title="fall")
+        changes, self._changes = self._changes, {}  # of this step, and of the pause before it
         if self._recorder is not None:
             self._recorder.append(sample, changes)
             if self._recorder.full:
@@ -201,6 +210,7 @@ class App:
     def _begin_recording(self) -> None:
         if self._recorder is None:
             self._recorder = Recorder(self.session.dt, self._shown(), self.session.describe())
+            self._changes.clear()  # they are in what describes the recording
 
     def _keep_recording(self) -> None:
         """End the recording, if there is one, and write it."""

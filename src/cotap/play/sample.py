@@ -7,14 +7,12 @@ import math
 import numpy as np
 import torch
 
+from cotap.compliance.laws import WITHOUT_STIFFNESS
 from cotap.envs import H1Env
 from cotap.evaluation.rollout import trajectory_row
 
 Sample = dict[str, np.ndarray]
 """One step of W robots, (W, ...) each, by the names of `Trajectory` and of `recording.SCENE`."""
-
-COMMANDS_NO_STIFFNESS = ("pd", "soft-pd")
-"""Laws whose K_ee means nothing."""
 
 
 def take_sample(env: H1Env, fell: torch.Tensor, laws: list[list[str]], force_h: torch.Tensor) -> Sample:
@@ -30,7 +28,7 @@ def take_sample(env: H1Env, fell: torch.Tensor, laws: list[list[str]], force_h: 
     points_w, reference_w = _hands_w(env, reference)
     jacobian_h = _to_heading(env).unsqueeze(1) @ env.reader.arm_chains.jacobian(state.arms)
     stiffness = env.arm_stiffness()
-    none = [[law in COMMANDS_NO_STIFFNESS for law in row] for row in laws]
+    none = [[law in WITHOUT_STIFFNESS for law in row] for row in laws]
     commanded = env.upper_body.parameters.stiffness.masked_fill(torch.tensor(none).unsqueeze(-1), math.nan)
     eigenvalues = torch.linalg.eigvalsh(stiffness)
     scene = {

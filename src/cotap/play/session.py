@@ -18,9 +18,13 @@ from cotap.envs import H1Env, H1EnvConfig
 from cotap.envs.commands import STEADY_RAD
 from cotap.envs.reference import REST
 from cotap.evaluation.policy import Policy, load_policy
+from cotap.evaluation.quiet import quiet
 from cotap.play.controls import AXES, ROBOTS, Control, Ranges, make_controls
 from cotap.play.forces import HandLoads, Push
 from cotap.play.sample import Sample, take_sample
+
+GAIT = ("gait_period_s", "step_apart_m", "step_clear_m", "step_timing")
+"""Fields of `CommandConfig` that shape what is fed forward to the legs."""
 
 
 class Session:
@@ -82,6 +86,20 @@ class Session:
                 self.values[name] = before
                 notices.append(str(error))
         return notices
+
+    def trained_otherwise(self, checkpoint: str) -> str:
+        """What to tell people about a checkpoint that runs under another gait than it was trained with; else empty.
+
+        The environment, and with it what is fed forward to the legs, is that of the first checkpoint.
+        """
+        trained = from_plain(H1EnvConfig, self._policy(checkpoint).config["training"]["env"]).commands
+        here = self.env.cfg.commands
+        differ = [
+            f"{name} {getattr(trained, name)} (here {getattr(here, name)})"
+            for name in GAIT
+            if getattr(trained, name) != getattr(here, name)
+        ]
+        return f"{checkpoint} was trained with {', '.join(differ)}" if differ else ""
 
     def push(self, push: Push) -> None:
         """Push every robot's hand."""
@@ -206,11 +224,10 @@ class Session:
 
 def play_config(env: H1EnvConfig) -> H1EnvConfig:
     """Turn the environment that a policy was trained in into the page's. Changes and returns `env`."""
+    quiet(env)
     env.num_envs, env.num_threads, env.backend = len(ROBOTS), 1, "mjbatch"
-    env.assist.enabled = env.hand_forces.enabled = env.blows.enabled = env.randomization.enabled = False
-    env.observations.noise.enabled = False
     env.terminations.episode_s = 1e6
-    env.impedance.share, env.commands.steady_rad = 0.0, STEADY_RAD
+    env.commands.steady_rad = STEADY_RAD
     env.upper_body.sampling.enabled = False  # what the page sets stays
     env.motions.clips.share, env.motions.clips.only, env.motions.clips.held_out = 1.0, (), ()
     for weights in (env.rewards.lower, env.rewards.upper):  # nobody learns here; a group must have one term
