@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -74,6 +75,13 @@ def test_files_that_are_no_recordings_are_refused_by_name(recording, tmp_path, c
         ("scene.qpos", lambda a: a * np.nan),
         ("trajectory.velocity", lambda a: a.astype(object)),
         ("trajectory.dt", lambda a: a * 0.0),
+        ("trajectory.dt", lambda a: np.array([a, a])),
+        ("trajectory.velocity", lambda a: a[..., :2]),
+        ("trajectory.fell", lambda a: a.astype(np.float32)),
+        ("trajectory.height", lambda a: a.astype(">f4")),
+        ("trajectory.hand_error", lambda a: a[..., :1]),
+        ("trajectory.arm_torque", lambda a: a[..., :0]),
+        ("trajectory.arm_torque", lambda a: a * np.float32(1e30)),
         ("scene.hand_w", None),
     ],
 )
@@ -86,6 +94,36 @@ def test_arrays_that_do_not_fit_are_refused_by_name(recording, tmp_path, name, c
     else:
         arrays[name] = change(arrays[name])
     np.savez(path, **arrays)
+    with pytest.raises(RecordingError, match=r"r\.npz"):
+        load_recording(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda s: s.clear(), "settings.sides must name the hands"),
+        (lambda s: s.update(gait_period_s=0.0), r"gait_period_s must lie in \[0.1, 10.0\], got 0.0"),
+        (lambda s: s.update(gait_period_s=[1]), r"gait_period_s must be a finite number, got \[1\]"),
+        (lambda s: s.update(sides=["left", "left"]), "settings.sides"),
+        (lambda s: s.update(sides=["left"]), r"hand_offset has shape .* H = 1"),
+        (lambda s: s.update(robot=["h1"]), "settings.robot must be a name"),
+        (lambda s: s.update(values={"a": float("inf")}), "settings must be a finite number, got inf"),
+        (lambda s: s.update(values=json.loads("[" * 20 + "]" * 20)), "nested more than 8 deep"),
+    ],
+)
+def test_settings_that_are_none_are_refused_by_name(recording, tmp_path, change, message):
+    path = tmp_path / "r.npz"
+    settings = json.loads(json.dumps(recording.settings))
+    change(settings)
+    replace(recording, settings=settings).save(path)
+    with pytest.raises(RecordingError, match=rf"r\.npz.*{message}"):
+        load_recording(path)
+
+
+def test_a_head_nested_without_end_is_refused(recording, tmp_path):
+    path = tmp_path / "r.npz"
+    recording.save(path)
+    np.savez(path, **(dict(np.load(path)) | {"head": "[" * 100_000}))
     with pytest.raises(RecordingError, match=r"r\.npz"):
         load_recording(path)
 

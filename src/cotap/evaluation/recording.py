@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from cotap.checks import require_range
+from cotap.checks import require_finite, require_range
 from cotap.evaluation.disturbance import response_measures, window_measures
 from cotap.evaluation.metrics import summarize, tracking_measures
 from cotap.evaluation.rollout import STEPPED, Trajectory
@@ -21,10 +21,22 @@ from cotap.files import write_atomically
 
 FORMAT, VERSION = "cotap-recording", 1
 SCENE = {
-    "qpos": 1, "hand_w": 2, "hand_reference_w": 2, "hand_force_w": 2, "heading_w": 2, "commanded_stiffness": 2,
-    "effective_stiffness": 3, "stiffness_eigenvalues": 2,
+    "qpos": ("Q",), "hand_w": ("H", 3), "hand_reference_w": ("H", 3), "hand_force_w": ("H", 3), "heading_w": (3, 3),
+    "commanded_stiffness": ("H", 3), "effective_stiffness": ("H", 3, 3), "stiffness_eigenvalues": ("H", 2),
 }  # fmt: skip
-"""What is shown beside the trajectory, and the number of dimensions after (T, N)."""
+"""What is shown beside the trajectory, and its sizes after (T, N); those that a letter stands for are all alike."""
+_TRAJECTORY = {
+    "velocity": (3,), "command": (3,), "stand": (), "told_to_stand": (), "height": (), "height_command": (),
+    "position": (2,), "arm_error": ("U",), "arm_velocity": ("U",), "arm_torque": ("U",), "arm_at_limit": (),
+    "arm_static_torque": ("U",), "hand_offset": ("H", 3), "hand_error": ("H",), "foot_contact": ("F",),
+    "foot_speed": ("F",), "foot_height": ("F",), "path_error": (), "fell": (),
+}  # fmt: skip
+_EVENTS = ("stand", "told_to_stand", "arm_at_limit", "foot_contact", "fell")
+"""Of these, what is true or false; all else is in single precision."""
+_LARGEST = 1e12
+"""Whatever is larger was measured on no robot, and its square soon is no number."""
+_LEVELS = 8
+"""How deep settings may be nested; five levels are in use."""
 MAX_BYTES = 4 << 30
 """Largest size of a recording's arrays; an hour of two robots takes half of it."""
 
@@ -72,11 +84,14 @@ def load_recording(path: Path | str) -> Recording:
         head = json.loads(str(arrays.pop("head")))
         kind, version = head["format"], head["version"]
         settings = head["settings"]
-    except (OSError, ValueError, LookupError, TypeError, EOFError, zipfile.BadZipFile) as error:
+    except Exception as error:  # zip, zlib, numpy and JSON each fail in ways of their own on rubbish
         raise RecordingError(f"{str(path)!r} is not a cotap recording, or is truncated: {error}") from error
     if kind != FORMAT or version != VERSION:
         raise RecordingError(f"{str(path)!r} is a {kind!r} of version {version!r}; this cotap reads {FORMAT} {VERSION}")
-    return _assemble(path, arrays, settings)
+    try:
+        return _assemble(arrays, settings)
+    except ValueError as error:
+        raise RecordingError(f"recording {str(path)!r}: {error}") from error
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
@@ -90,33 +105,71 @@ def _read(path: Path) -> dict[str, np.ndarray]:
         }
 
 
-def _assemble(path: Path, arrays: dict[str, np.ndarray], settings: Any) -> Recording:
-    names = [f"trajectory.{name}" for name in ("dt", *STEPPED)] + [f"scene.{name}" for name in SCENE]
-    missing = [name for name in names if name not in arrays]
+def _assemble(arrays: dict[str, np.ndarray], settings: Any) -> Recording:
+    missing = [n for n in ("trajectory.dt", *(f"trajectory.{n}" for n in STEPPED), *(f"scene.{n}" for n in SCENE))
+               if n not in arrays]  # fmt: skip
     if missing:
-        raise RecordingError(f"recording {str(path)!r} lacks {missing[0]!r}")
-    if not isinstance(settings, dict):
-        raise RecordingError(f"recording {str(path)!r} has no settings")
-    steps = arrays["trajectory.fell"].shape
-    if len(steps) != 2 or 0 in steps:
-        raise RecordingError(f"recording {str(path)!r} has no steps: trajectory.fell has shape {steps}")
-    for name in names:
-        value = arrays[name]
-        if name != "trajectory.dt" and value.shape[:2] != steps:
-            raise RecordingError(f"recording {str(path)!r}: {name} has shape {value.shape}, not {steps} and more")
-        if value.dtype.kind not in "fb":
-            raise RecordingError(f"recording {str(path)!r}: {name} holds {value.dtype}, not numbers")
-    dt = float(arrays["trajectory.dt"])
-    if not (math.isfinite(dt) and 0.0 < dt <= 1.0):
-        raise RecordingError(f"recording {str(path)!r}: dt must lie in (0, 1] s, got {dt}")
-    for name, dimensions in SCENE.items():
+        raise ValueError(f"it lacks {missing[0]!r}")
+    dt = _step(arrays["trajectory.dt"])
+    _check_settings(settings, dt)
+    sizes = {"H": len(settings["sides"])}
+    for name, shape in _TRAJECTORY.items():
+        value = arrays[f"trajectory.{name}"]
+        _check_array(f"trajectory.{name}", value, shape, (np.bool_ if name in _EVENTS else np.float32,), sizes)
+    for name, shape in SCENE.items():
         value = arrays[f"scene.{name}"]
-        if value.ndim != 2 + dimensions:
-            raise RecordingError(f"recording {str(path)!r}: scene.{name} has shape {value.shape}")
+        _check_array(f"scene.{name}", value, shape, (np.float32, np.float64), sizes)
         if name != "commanded_stiffness" and not np.isfinite(value).all():
-            raise RecordingError(f"recording {str(path)!r}: scene.{name} has values that are not finite")
+            raise ValueError(f"scene.{name} has values that are not finite")
     tensors = {name: torch.from_numpy(arrays[f"trajectory.{name}"]) for name in STEPPED}
     return Recording(Trajectory(dt=dt, **tensors), {name: arrays[f"scene.{name}"] for name in SCENE}, settings)
+
+
+def _step(value: np.ndarray) -> float:
+    """The control step [s]."""
+    if value.dtype.kind != "f" or value.ndim:
+        raise ValueError(f"dt must be one number, got {value.dtype} of shape {value.shape}")
+    return require_range("dt", float(value), 1e-4, 1.0)
+
+
+def _check_array(
+    name: str, value: np.ndarray, shape: tuple[str | int, ...], kinds: tuple[type, ...], sizes: dict[str, int]
+) -> None:
+    """Raise ValueError unless this is (T, N, *shape) of one of `kinds`; adds sizes that are new to `sizes`."""
+    if value.dtype not in kinds:
+        raise ValueError(f"{name} holds {value.dtype}, not {' or '.join(kind.__name__ for kind in kinds)}")
+    full = ("T", "N", *shape)
+    wanted = tuple(sizes.setdefault(d, n) if isinstance(d, str) else d for d, n in zip(full, value.shape, strict=False))
+    if value.ndim != len(full) or value.shape != wanted or 0 in wanted:
+        known = ", ".join(f"{letter} = {size}" for letter, size in sizes.items())
+        raise ValueError(f"{name} has shape {value.shape}, not ({', '.join(map(str, full))}) with {known}, none 0")
+    if (np.abs(value) > _LARGEST).any():
+        raise ValueError(f"{name} has values beyond {_LARGEST:g}")
+
+
+def _check_settings(settings: Any, dt: float) -> None:
+    """Raise ValueError unless these are settings as `Recording` has them."""
+    if not isinstance(settings, dict):
+        raise ValueError(f"settings must be a table, got {settings!r:.80}")
+    _check_plain("settings", settings, _LEVELS)
+    sides, robot = settings.get("sides", []), settings.get("robot")
+    named = isinstance(sides, list) and all(isinstance(side, str) for side in sides)
+    if not named or not 0 < len(sides) == len(set(sides)):
+        raise ValueError(f"settings.sides must name the hands, got {sides!r:.80}")
+    if not isinstance(robot, str):
+        raise ValueError(f"settings.robot must be a name, got {robot!r:.80}")
+    require_range("settings.gait_period_s", settings.get("gait_period_s", math.nan), max(dt, 0.1), 10.0)
+
+
+def _check_plain(name: str, value: Any, levels: int) -> None:
+    """Raise ValueError for what cannot be written as JSON again: numbers beyond floats, and nesting without end."""
+    if isinstance(value, (dict, list)):
+        if levels == 0:
+            raise ValueError(f"{name} is nested more than {_LEVELS} deep")
+        for inner in value.values() if isinstance(value, dict) else value:
+            _check_plain(name, inner, levels - 1)
+    elif isinstance(value, (int, float)) and not isinstance(value, bool):
+        require_finite(f"a value in {name}", value)
 
 
 @dataclass
@@ -155,7 +208,7 @@ def measure(recording: Recording, protocol: RecordingProtocol) -> dict[str, Any]
     """
     t = recording.trajectory
     steps, count = t.fell.shape
-    measures = tracking_measures(t, float(recording.settings["gait_period_s"]), protocol.settle_seconds)
+    measures = tracking_measures(t, recording.settings["gait_period_s"], protocol.settle_seconds)
     window = {"start": 0.0, "end": steps * t.dt}
     loaded = first_force(recording)
     # Half a second of quiet before, so that there is something to recover to.
@@ -163,7 +216,7 @@ def measure(recording: Recording, protocol: RecordingProtocol) -> dict[str, Any]
         sides = recording.settings["sides"]
         hit = [i for i, side in enumerate(sides) if loaded[1] in (side, "both")]
         onset = round(loaded[0] / t.dt)
-        end = onset + round(protocol.window_seconds / t.dt)
+        end = onset + max(1, round(protocol.window_seconds / t.dt))
         after = window_measures(t, onset, end, hit) | response_measures(t, onset, onset, end, hit)
         measures |= {f"force_{name}": value for name, value in after.items()}
         window |= {"force_start": loaded[0], "force_end": loaded[0] + protocol.window_seconds}

@@ -29,7 +29,7 @@ class Replay:
         path: Where it was read; a film is written beside it.
 
     Raises:
-        RecordingError: it is of a robot that this cotap does not know.
+        RecordingError: it is of a robot that this cotap does not know, or not of that robot.
     """
 
     def __init__(self, server: viser.ViserServer, recording: Recording, path: Path) -> None:
@@ -38,6 +38,9 @@ class Replay:
             raise RecordingError(f"the recording's robot {robot!r} is unknown; known: {', '.join(KNOWN_ROBOTS)}")
         self._samples, self._dt = samples_of(recording), recording.trajectory.dt
         spec = KNOWN_ROBOTS[robot]()
+        width, sides = recording.scene["qpos"].shape[2], recording.settings["sides"]
+        if width != 7 + len(spec.joints) or sides != [arm.side for arm in spec.arms]:
+            raise RecordingError(f"a recording of {width} positions and the hands {sides} is of no {spec.name!r}")
         self._count = recording.trajectory.fell.shape[1]
         self._stop = threading.Event()
         self.scene = Scene(server, spec, self._count)
