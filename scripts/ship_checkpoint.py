@@ -71,7 +71,7 @@ def ship(source: Path, name: str, before: list[Path]) -> int:
     target.parent.mkdir(exist_ok=True)
     # Where the machine keeps the repository is nobody's business.
     config = content["config"] | {"command": content["config"]["command"].replace(f"{Path.cwd()}/", "")}
-    save_checkpoint(target, content | {"learner": {}, "env": {}, "config": config})
+    save_checkpoint(target, content | {"learner": {}, "env": {}, "others": [], "config": config})
     write_json(
         target.with_suffix(".json"),
         {

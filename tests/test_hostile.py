@@ -25,6 +25,17 @@ from cotap.configs import BASE_RECIPES, BaseTraining, from_plain, to_plain
 from cotap.envs import H1Env
 from cotap.evaluation.law_options import parse_law
 from cotap.evaluation.policy import load_policy
+from cotap.evaluation.recording import (
+    EVENTS,
+    SCENE,
+    TRAJECTORY,
+    Recording,
+    RecordingError,
+    RecordingProtocol,
+    load_recording,
+    measure,
+)
+from cotap.evaluation.rollout import Trajectory
 from cotap.motions.formats import FORMATS
 from cotap.motions.joblib_files import load_joblib
 from cotap.motions.library import MotionError, MotionLibrary, shipped_library
@@ -265,6 +276,62 @@ def test_a_motion_file_with_changed_bytes_is_read_or_refused(
         assert str(error)  # noqa: PT017
     else:
         assert all(np.isfinite(c.arms).all() for c in clips)
+
+
+SIZES = {"T": 6, "N": 2, "U": 8, "H": 2, "F": 2, "Q": 26}
+
+
+def small_recording() -> Recording:
+    """Two robots for a tenth of a second; numbers of no meaning, kinds and shapes as they are recorded."""
+
+    def zeros(shape: tuple[str | int, ...], dtype: torch.dtype) -> torch.Tensor:
+        return torch.zeros([SIZES.get(d, d) if isinstance(d, str) else d for d in ("T", "N", *shape)], dtype=dtype)
+
+    kinds = {name: torch.bool if name in EVENTS else torch.float32 for name in TRAJECTORY}
+    fields = {name: zeros(shape, kinds[name]) for name, shape in TRAJECTORY.items()}
+    scene = {name: zeros(shape, torch.float64).numpy() for name, shape in SCENE.items()}
+    about = {"robot": "h1", "sides": ["left", "right"], "gait_period_s": 0.8, "changes": [[0, {"k": 300.0}]]}
+    return Recording(Trajectory(dt=0.02, **fields), scene, about)
+
+
+def is_recording(path: Path) -> None:
+    """A file is read and measured, or refused by name."""
+    try:
+        read = load_recording(path)
+    except RecordingError as error:
+        assert path.name in str(error)  # noqa: PT017
+    else:
+        json.dumps(measure(read, RecordingProtocol(str(path))))
+
+
+@few
+@given(draw=st.data())
+def test_a_recording_with_changed_bytes_is_read_or_refused(tmp_path: Path, draw: st.DataObject):
+    path = tmp_path / "r.npz"
+    small_recording().save(path)
+    path.write_bytes(changed_bytes(path.read_bytes(), draw))
+    is_recording(path)
+
+
+@few
+@given(draw=st.data())
+def test_a_recording_with_changed_settings_is_read_or_refused(tmp_path: Path, draw: st.DataObject):
+    path, whole = tmp_path / "r.npz", small_recording()
+    json_values = st.recursive(
+        st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
+        lambda v: st.lists(v, max_size=3) | st.dictionaries(st.text(max_size=4), v, max_size=3),
+        max_leaves=4,
+    )
+    Recording(whole.trajectory, whole.scene, damage(whole.settings, draw, json_values)).save(path)
+    is_recording(path)
+
+
+@few
+@given(name=st.sampled_from(sorted(SCENE)), shape=st.lists(st.integers(0, 6), max_size=4), kind=st.sampled_from("fi?U"))
+def test_a_recording_with_another_array_is_read_or_refused(tmp_path: Path, name: str, shape: list[int], kind: str):
+    path, whole = tmp_path / "r.npz", small_recording()
+    Recording(whole.trajectory, whole.scene | {name: np.zeros(shape, kind)}, whole.settings).save(path)
+    is_recording(path)
 
 
 @few

@@ -104,8 +104,8 @@ class AdmittanceLaw(Remembering):
     leave those that were sent by what the hand's displacement asks for and no faster than joints can turn: without a
     force, targets at rest are tracked as they were sent.
 
-    The tracking law is told the rate of the targets that were sent, not of the moved ones: critical damping resists what
-    the force adds to the motion. With the moved rate it would not, and nor would it hold against stiff walls.
+    The tracking law is told the rate of the targets that were sent, not of the moved ones: critical damping resists
+    what the force adds to the motion. With the moved rate it would not, and nor would it hold against stiff walls.
 
     Args:
         arms: What is driven.

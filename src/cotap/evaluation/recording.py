@@ -20,18 +20,19 @@ from cotap.evaluation.rollout import STEPPED, Trajectory
 from cotap.files import write_atomically
 
 FORMAT, VERSION = "cotap-recording", 1
-SCENE = {
+SCENE: dict[str, tuple[str | int, ...]] = {
     "qpos": ("Q",), "hand_w": ("H", 3), "hand_reference_w": ("H", 3), "hand_force_w": ("H", 3), "heading_w": (3, 3),
     "commanded_stiffness": ("H", 3), "effective_stiffness": ("H", 3, 3), "stiffness_eigenvalues": ("H", 2),
 }  # fmt: skip
 """What is shown beside the trajectory, and its sizes after (T, N); those that a letter stands for are all alike."""
-_TRAJECTORY = {
+TRAJECTORY: dict[str, tuple[str | int, ...]] = {
     "velocity": (3,), "command": (3,), "stand": (), "told_to_stand": (), "height": (), "height_command": (),
     "position": (2,), "arm_error": ("U",), "arm_velocity": ("U",), "arm_torque": ("U",), "arm_at_limit": (),
     "arm_static_torque": ("U",), "hand_offset": ("H", 3), "hand_error": ("H",), "foot_contact": ("F",),
     "foot_speed": ("F",), "foot_height": ("F",), "path_error": (), "fell": (),
 }  # fmt: skip
-_EVENTS = ("stand", "told_to_stand", "arm_at_limit", "foot_contact", "fell")
+"""The same of the trajectory."""
+EVENTS = ("stand", "told_to_stand", "arm_at_limit", "foot_contact", "fell")
 """Of these, what is true or false; all else is in single precision."""
 _LARGEST = 1e12
 """Whatever is larger was measured on no robot, and its square soon is no number."""
@@ -113,9 +114,9 @@ def _assemble(arrays: dict[str, np.ndarray], settings: Any) -> Recording:
     dt = _step(arrays["trajectory.dt"])
     _check_settings(settings, dt)
     sizes = {"H": len(settings["sides"])}
-    for name, shape in _TRAJECTORY.items():
+    for name, shape in TRAJECTORY.items():
         value = arrays[f"trajectory.{name}"]
-        _check_array(f"trajectory.{name}", value, shape, (np.bool_ if name in _EVENTS else np.float32,), sizes)
+        _check_array(f"trajectory.{name}", value, shape, (np.bool_ if name in EVENTS else np.float32,), sizes)
     for name, shape in SCENE.items():
         value = arrays[f"scene.{name}"]
         _check_array(f"scene.{name}", value, shape, (np.float32, np.float64), sizes)

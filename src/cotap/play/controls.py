@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from cotap.checks import is_finite
 from cotap.compliance.laws import DAMPINGS, ERRORS, LawConfig
 
 ROBOTS = ("a", "b")
@@ -31,7 +31,7 @@ class Number:
 
     def clean(self, value: object) -> tuple[float, str | None]:
         """`value` within the range, and a notice if it had to be moved there. Raises Refused for what is no number."""
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        if not is_finite(value):
             raise Refused(f"{self.label} must be a finite number, got {_shown(value)}")
         inside = min(max(float(value), self.low), self.high)
         notice = None
