@@ -162,7 +162,6 @@ def test_a_file_that_differs_from_torch_is_not_kept(policy_file, tmp_path, monke
         (["--output", "p.pt"], "must end in .onnx"),
         (["--output", "nowhere/p.onnx"], "folder does not exist"),
         (["--output", "p.onnx", "--checkpoint", "missing.pt"], "'missing.pt' does not exist"),
-        (["--output", "p.onnx", "--checkpoint", "cotap-goals"], "'cotap-goals' is not shipped"),
         (["--output", "p.onnx", "--checks", "0"], "checks must be a positive integer"),
     ],
 )

@@ -225,7 +225,7 @@ def test_the_command_writes_what_was_asked_for(protocol, tmp_path, capsys):
         (["--pelvis", "glued"], "pelvis 'glued' is unknown"),
         (["--motion", "mixture", "walk"], "stands alone"),
         (["--arm-pose", "9", "0", "0", "0"], "arm_pose[0]"),
-        (["--checkpoint", "cotap-goals"], "'cotap-goals' is not shipped"),
+        (["--checkpoint", "cotap-gaols"], "'cotap-gaols' does not exist"),
         (["--force", "nan", "0", "0"], "force.force[0]"),
         (["--motion", "moonwalk"], "no clip is called 'moonwalk'"),
     ],

@@ -9,6 +9,7 @@ import torch
 from cotap.agents.checkpoint import load_checkpoint, save_checkpoint, sha256
 from cotap.configs import to_plain
 from cotap.evaluate import main
+from cotap.evaluation import policy
 from cotap.evaluation.policy import load_policy, shipped_checkpoint, shipped_names
 from cotap.evaluation.render import RenderingUnavailable, open_renderer
 from cotap.robots import h1
@@ -38,6 +39,12 @@ def test_shipped_policy_reproduces_its_evaluation(tmp_path: Path, name: str):
     assert result["num_falls"] <= shipped["num_falls"] + 1
     for axis in ("slope_x", "slope_y", "slope_yaw"):
         assert result["slopes"][axis] == pytest.approx(shipped["slopes"][axis], abs=0.08)
+
+
+def test_a_name_whose_checkpoint_is_not_there_is_refused(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(policy, "CHECKPOINTS", (*policy.CHECKPOINTS, "cotap-next"))
+    with pytest.raises(ValueError, match="'cotap-next' is not shipped; shipped are: base, cotap, facet"):
+        shipped_checkpoint("cotap-next")
 
 
 @pytest.mark.parametrize("name", shipped_names())
