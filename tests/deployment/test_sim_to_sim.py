@@ -21,7 +21,7 @@ from cotap.deployment.engines import EngineConfig
 from cotap.deployment.robot import Perturbations
 from cotap.deployment.safety import SafetyConfig
 from cotap.deployment.scenario import Scenario
-from cotap.deployment.sim_to_sim import Comparison, falls, loads, periodic, statics
+from cotap.deployment.sim_to_sim import Comparison, falls, loads, mean_pose, periodic, statics
 from cotap.deployment.trial import Trial
 from cotap.deployment.workers import Workers
 from cotap.envs.upper_body import UpperBodyConfig
@@ -71,6 +71,14 @@ def test_trials_that_fell_are_in_no_figure_of_the_hand(spec: RobotSpec, part: Ca
         assert one["arms"]["left"]["hand_swing_m"] == pytest.approx(0.05, rel=1e-3)
         assert none["arms"]["left"]["hand_swing_m"] is None
     assert two["falls"] == none["falls"] == 1
+
+
+def test_orientations_of_either_sign_are_averaged():
+    half = math.sqrt(0.5)
+    poses = np.array([[0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.2], [2.0, 0.0, 1.0, -half, 0.0, 0.0, -half, 0.4]])
+    quarter = math.pi / 8.0  # the half of 45 degrees about z
+    expected = [1.0, 0.0, 1.0, math.cos(quarter), 0.0, 0.0, math.sin(quarter), 0.3]
+    np.testing.assert_allclose(mean_pose(poses), expected, atol=1e-12)
 
 
 def stand(spec: RobotSpec, falls: bool) -> Trial:

@@ -217,8 +217,8 @@ def periodic(
         return out
     hands = t.hand_offset[begin:, stood, :, 2].mean(1)
     torque = t.arm_torque[begin:, stood][:, :, elbow_joints(spec)].mean(1)
-    poses = [np.mean(trial.qpos[begin:], 0) for trial in trials if not trial.fell]
-    predicted = statics(spec, laws, np.mean(poses, 0), amplitude)
+    poses = np.concatenate([trial.qpos[begin:] for trial in trials if not trial.fell])
+    predicted = statics(spec, laws, mean_pose(poses), amplitude)
     moments, heights = swing_amplitude(torque, period, t.dt), swing_amplitude(hands, period, t.dt)
     out["time"] = (np.arange(len(torque)) * t.dt).tolist()
     for i, arm in enumerate(spec.arms):
@@ -228,6 +228,15 @@ def periodic(
             "height": (hands[:, i] - hands[0, i]).tolist(),
         }
     return out
+
+
+def mean_pose(qpos: np.ndarray) -> np.ndarray:
+    """Mean (Q,) of configurations (T, Q); a quaternion and its negative are one orientation."""
+    aligned = np.array(qpos)
+    aligned[:, 3:7] *= np.where(qpos[:, 3:7] @ qpos[0, 3:7] < 0.0, -1.0, 1.0)[:, None]
+    mean = aligned.mean(0)
+    mean[3:7] /= np.linalg.norm(mean[3:7])
+    return mean
 
 
 def statics(spec: RobotSpec, laws: UpperBodyConfig, qpos: np.ndarray, force_z: float) -> list[tuple[float, float]]:
