@@ -67,37 +67,22 @@ def paper(base: BaseTraining) -> DistillTraining:
     return training
 
 
-def no_ratio(base: BaseTraining) -> DistillTraining:
-    """Ablation: compliance does not give way to PD near singular arms (paper, Table IV)."""
-    return without_ratio(default(base))
-
-
-def torque_critic(base: BaseTraining) -> DistillTraining:
-    """Ablation: the arms' torque is seen by the critics only (paper, appendix C)."""
-    return with_torque_for_critics(default(base))
-
-
-def goals(base: BaseTraining) -> DistillTraining:
-    """Ablation: actors see stiffness and alpha as commanded."""
-    return with_goals(default(base))
-
-
 def without_ratio(training: DistillTraining) -> DistillTraining:
-    """`training` without the singularity-aware ratio."""
+    """Ablation: compliance does not give way to PD near singular arms (paper, Table IV)."""
     training = copy.deepcopy(training)
     training.env.upper_body.singularity_ratio = False
     return training
 
 
 def with_torque_for_critics(training: DistillTraining) -> DistillTraining:
-    """`training` with the arms' torque moved from the actors' observation to the critics'."""
+    """Ablation: the arms' torque is seen by the critics only (paper, appendix C)."""
     training = copy.deepcopy(training)
     training.env.observations.arm_torque = "critic"
     return training
 
 
 def with_goals(training: DistillTraining) -> DistillTraining:
-    """`training` with stiffness and alpha, as commanded, in the actors' observation."""
+    """Ablation: actors see stiffness and alpha as commanded."""
     training = copy.deepcopy(training)
     training.env.observations.goals = True
     return training
@@ -112,15 +97,6 @@ def facet(base: BaseTraining) -> DistillTraining:
     return training
 
 
-DISTILL_RECIPES: dict[str, Callable[[BaseTraining], DistillTraining]] = {
-    "default": default,
-    "paper": paper,
-    "no-ratio": no_ratio,
-    "torque-critic": torque_critic,
-    "goals": goals,
-    "facet": facet,
-}
-"""Stage 2, by name."""
 DISTILL_CONTINUATIONS: dict[str, Callable[[DistillTraining], DistillTraining]] = {
     "no-ratio": without_ratio,
     "torque-critic": with_torque_for_critics,
@@ -129,3 +105,16 @@ DISTILL_CONTINUATIONS: dict[str, Callable[[DistillTraining], DistillTraining]] =
 """Recipes that may also go on from a checkpoint of stage 2, and then change its config."""
 OTHER_TERMS = ("torque-critic", "goals")
 """Recipes that change what networks see, and so refit those of the checkpoint that they begin from."""
+
+
+def _from_base(change: Callable[[DistillTraining], DistillTraining]) -> Callable[[BaseTraining], DistillTraining]:
+    return lambda base: change(default(base))
+
+
+DISTILL_RECIPES: dict[str, Callable[[BaseTraining], DistillTraining]] = {
+    "default": default,
+    "paper": paper,
+    **{name: _from_base(change) for name, change in DISTILL_CONTINUATIONS.items()},
+    "facet": facet,
+}
+"""Stage 2, by name."""

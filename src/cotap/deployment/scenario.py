@@ -150,21 +150,12 @@ def load_scenario(path: Path | str, spec: RobotSpec) -> Scenario:
         raise ValueError(f"scenario {str(path)!r} is not TOML: {error}") from error
     try:
         scenario = from_plain(Scenario, data)
-        scenario.command = _records(TimedCommand, "command", data)
-        scenario.force = _records(ForceProfile, "force", data)
         if not isinstance(scenario.arms, ArmMotion):
             raise ValueError(f"arms must be a table, got {scenario.arms!r}")
         scenario.check(spec)
     except (ValueError, TypeError) as error:
         raise ValueError(f"scenario {str(path)!r}: {error}") from error
     return scenario
-
-
-def _records(kind: type[Any], name: str, data: dict[str, Any]) -> tuple[Any, ...]:
-    entries = data.get(name, [])
-    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-        raise ValueError(f"{name} must be a list of tables ([[{name}]]), got {entries!r}")
-    return tuple(from_plain(kind, entry) for entry in entries)
 
 
 def _require_length(name: str, value: Any, length: int) -> None:

@@ -21,7 +21,7 @@ from cotap.deployment.safety import SafetyConfig
 from cotap.deployment.scenario import Scenario
 from cotap.deployment.trial import Pilot, Trial, run_trial, trajectory
 from cotap.envs import H1EnvConfig
-from cotap.envs.commands import STEADY_RAD, CommandConfig
+from cotap.envs.commands import CommandConfig
 from cotap.envs.upper_body import UpperBodyConfig
 from cotap.evaluation.metrics import summarize, tracking_measures
 from cotap.evaluation.protocols import VelocityTracking
@@ -40,7 +40,6 @@ def run_trials(
     spec = robot_of(policy.metadata)
     scenario.check(spec)
     commands = evaluation_commands(command_config(policy.metadata))
-    commands.steady_rad = STEADY_RAD
     engine = make_engine(engine_cfg, spec)
     try:
         robot = Robot(engine, engine_cfg, spec, policy.metadata.control_dt, perturbations)
