@@ -217,14 +217,17 @@ class Film:
                 raise ValueError(f"{path!r}: its folder does not exist")
         require_one_of("output's suffix", Path(self.output).suffix, (".webp", ".gif"))
         from cotap.evaluation.policy import default_checkpoint
+        from cotap.play import ROBOTS
         from cotap.play.app import App
+        from cotap.play.scene import Scene
         from cotap.play.server import open_server
         from cotap.play.session import Session
 
         port = free_port()
         server = open_server("127.0.0.1", port)
         with tempfile.TemporaryDirectory() as folder:
-            app = App(server, Session({"cotap": default_checkpoint()}, self.seed), Path(folder))
+            session = Session({"cotap": default_checkpoint()}, self.seed)
+            app = App(server, Scene(server, session.env.spec, len(ROBOTS)), session, Path(folder))
             server.initial_camera.position, server.initial_camera.look_at = (2.1, 1.4, 1.4), (0.0, 0.5, 0.85)
             thread = threading.Thread(target=app.run, daemon=True)
             thread.start()

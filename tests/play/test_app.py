@@ -6,23 +6,30 @@ import socket
 
 import numpy as np
 import pytest
+from viser import ViserServer
 
 from cotap.evaluation.policy import shipped_checkpoint
 from cotap.evaluation.recording import load_recording
+from cotap.play import ROBOTS
 from cotap.play.__main__ import main
 from cotap.play.app import App
 from cotap.play.controls import Refused
 from cotap.play.forces import Push
 from cotap.play.mailbox import Record, Reset, Step
 from cotap.play.plots import Plots, force_displacement
+from cotap.play.scene import Scene
 from cotap.play.server import PortTaken, open_server
 from cotap.play.session import Session
+
+
+def scene(server: ViserServer, session: Session) -> Scene:
+    return Scene(server, session.env.spec, len(ROBOTS))
 
 
 @pytest.fixture
 def app(session, free_port, tmp_path):
     server = open_server("127.0.0.1", free_port)
-    yield App(server, session, tmp_path / "out")
+    yield App(server, scene(server, session), session, tmp_path / "out")
     server.stop()
 
 
@@ -114,10 +121,22 @@ def test_a_checkpoint_that_is_refused_is_shown_as_it_was(app):
     assert app.panel._handles["a.checkpoint"].value == "base"
 
 
+def test_a_page_of_another_robot_than_the_policys_is_refused(session, free_port, tmp_path):
+    server = open_server("127.0.0.1", free_port)
+    try:
+        drawn = scene(server, session)
+        drawn.robot = "g1"
+        with pytest.raises(ValueError, match="shows 'g1', but the policy is of 'h1'"):
+            App(server, drawn, session, tmp_path)
+    finally:
+        server.stop()
+
+
 def test_a_policy_that_was_trained_with_another_gait_runs_and_says_so(free_port, tmp_path, monkeypatch):
     server = open_server("127.0.0.1", free_port)
     try:
-        app = App(server, Session({name: shipped_checkpoint(name) for name in ("cotap", "base")}), tmp_path)
+        two = Session({name: shipped_checkpoint(name) for name in ("cotap", "base")})
+        app = App(server, scene(server, two), two, tmp_path)
         told = []
         monkeypatch.setattr(app.notices, "tell", lambda text, title: told.append((title, text)))
         app.advance()
@@ -177,6 +196,7 @@ def test_what_cannot_be_shown_is_refused_before_anything_runs(free_port, tmp_pat
     assert main(["--port", "0"]) == 2
     assert main(["--port", str(free_port), "--replay", str(tmp_path / "none.npz")]) == 2
     assert main(["--port", str(free_port), "--checkpoint", str(tmp_path / "none.pt")]) == 2
+    assert main(["--port", str(free_port), "--robot", "atlas"]) == 2
     err = capsys.readouterr().err
     assert "none.npz" in err
     assert "none.pt" in err

@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 
 from cotap.evaluation.policy import shipped_checkpoint
+from cotap.play import ROBOTS
 from cotap.play.app import App
+from cotap.play.scene import Scene
 from cotap.play.server import open_server
 from cotap.play.session import Session
 
@@ -68,7 +70,8 @@ def page(free_port: int, tmp_path: Path) -> Iterator[Page]:
     from playwright.sync_api import sync_playwright
 
     server = open_server("127.0.0.1", free_port)
-    app = App(server, Session({"base": shipped_checkpoint("base")}), tmp_path)
+    session = Session({"base": shipped_checkpoint("base")})
+    app = App(server, Scene(server, session.env.spec, len(ROBOTS)), session, tmp_path)
     thread = threading.Thread(target=app.run, daemon=True)
     thread.start()
     with sync_playwright() as playwright:

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING
 
 import tyro
 
+from cotap.checks import require_one_of
+from cotap.play import ROBOTS
 from cotap.play.lean import import_tensordict, uncollected
 
 if TYPE_CHECKING:
@@ -29,6 +31,8 @@ class PlayOptions:
     """Port to listen at."""
     checkpoint: tuple[str, ...] = ()
     """Checkpoints to choose from beside the shipped ones; the first of these runs at first."""
+    robot: str = "h1"
+    """Robot whose policies these are."""
     replay: str = ""
     """Show this recording (.npz) instead of simulating."""
     output: str = "runs/play"
@@ -73,6 +77,13 @@ def _run(options: PlayOptions) -> int:
 
 
 def _live(options: PlayOptions, server: ViserServer) -> App:
+    from cotap.play.scene import Scene
+    from cotap.robots import ROBOTS as KNOWN_ROBOTS
+
+    require_one_of("robot", options.robot, KNOWN_ROBOTS)
+    scene = Scene(server, KNOWN_ROBOTS[options.robot](), len(ROBOTS))
+    server.flush()  # browsers prepare it while the rest is loaded
+
     import torch
 
     import_tensordict()  # before what would import it whole
@@ -85,7 +96,7 @@ def _live(options: PlayOptions, server: ViserServer) -> App:
     checkpoints = {path: Path(path) for path in options.checkpoint}
     names = sorted(shipped_names(), key=lambda name: name != "cotap")  # the first is what the page begins with
     checkpoints |= {f"shipped {name}": shipped_checkpoint(name) for name in names}
-    return App(server, Session(checkpoints, options.seed), Path(options.output))
+    return App(server, scene, Session(checkpoints, options.seed), Path(options.output))
 
 
 def _replay(options: PlayOptions, server: ViserServer) -> Replay:

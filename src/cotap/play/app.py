@@ -9,8 +9,8 @@ from typing import Any
 
 import viser
 
+from cotap.play import ROBOTS
 from cotap.play.archive import Archive
-from cotap.play.controls import ROBOTS
 from cotap.play.forces import Push
 from cotap.play.mailbox import Mailbox, Record, Reset, Step
 from cotap.play.notices import Notices
@@ -23,6 +23,8 @@ from cotap.play.scene import Scene
 from cotap.play.session import Session
 
 DRAW_HZ, PLOT_HZ, STATUS_HZ = 25.0, 4.0, 2.0
+PLOTS_AFTER_S = 1.5
+"""The robot and its controls come first; a browser takes half a second to make the plots [s]."""
 
 
 class App:
@@ -30,12 +32,18 @@ class App:
 
     Args:
         server: The page, opened.
+        scene: Where it is drawn, of all robots.
         session: What is simulated.
         folder: Where recordings go.
+
+    Raises:
+        ValueError: the scene is of another robot than the session.
     """
 
-    def __init__(self, server: viser.ViserServer, session: Session, folder: Path) -> None:
-        self.session, self.server = session, server
+    def __init__(self, server: viser.ViserServer, scene: Scene, session: Session, folder: Path) -> None:
+        if scene.robot != session.env.spec.name:
+            raise ValueError(f"the page shows {scene.robot!r}, but the policy is of {session.env.spec.name!r}: --robot")
+        self.session, self.server, self.scene = session, server, scene
         self.mailbox = Mailbox(session.controls)
         self.notices = Notices(server)
         self.archive = Archive(folder, self.notices)
@@ -46,7 +54,6 @@ class App:
         self._changes: dict[str, Any] = {}
         self._latest: tuple[int, Sample] | None = None
         with server.atomic():
-            self.scene = Scene(server, session.env.spec, len(ROBOTS))
             self.panel = Panel(server, self.mailbox, session.sides, self.notices)
             self._add_tabs()
         self.scene.hands.on_drag("left")(self._drag)
@@ -129,7 +136,7 @@ class App:
             self._stop.set()
 
     def _draw_until_stopped(self) -> None:
-        due = {"plots": 0.0, "status": 0.0}
+        due = {"plots": time.monotonic() + PLOTS_AFTER_S, "status": 0.0}
         drawn = None
         while not self._stop.wait(1.0 / DRAW_HZ):
             now = time.monotonic()

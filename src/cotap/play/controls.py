@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 from cotap.checks import is_finite
 from cotap.compliance.laws import DAMPINGS, ERRORS, LawConfig
+from cotap.play import ROBOTS
 
-ROBOTS = ("a", "b")
-"""The two robots; the second is shown in the side-by-side mode."""
 AXES = ("x", "y", "z")
 
 Value = float | bool | str | tuple[float, ...] | None

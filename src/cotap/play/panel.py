@@ -7,7 +7,8 @@ from typing import Any
 
 import viser
 
-from cotap.play.controls import AXES, ROBOTS, Choice, Control, Flag, Number, Refused
+from cotap.play import ROBOTS
+from cotap.play.controls import AXES, Choice, Control, Flag, Number, Refused
 from cotap.play.forces import PUSH_N, PUSH_S, Push
 from cotap.play.mailbox import Mailbox, Request, Reset, Step
 from cotap.play.notices import Notices

@@ -10,7 +10,7 @@ import numpy as np
 import viser
 from viser import uplot
 
-from cotap.play.controls import ROBOTS
+from cotap.play import ROBOTS
 from cotap.play.sample import Sample
 
 SECONDS = 10.0

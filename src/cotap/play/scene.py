@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import trimesh
 import viser
 from mjviser import ViserMujocoScene
 from viser import transforms as tf
 
-from cotap.play.sample import Sample
 from cotap.play.visuals import RobotPose, visual_model
 from cotap.robots import RobotSpec
+
+if TYPE_CHECKING:  # the scene is shown before torch is there
+    from cotap.play.sample import Sample
 
 APART_M = 1.5
 """How far to its right the second robot is shown from where its own world has it [m]."""
@@ -43,6 +47,7 @@ class Scene:
     def __init__(self, server: viser.ViserServer, spec: RobotSpec, count: int) -> None:
         self.shown, self.follow = 1, True
         self.ellipsoids, self.contacts = True, True
+        self.robot = spec.name
         self._server, self._count, self._hands = server, count, len(spec.arms)
         model, self.shapes = visual_model(spec)
         self._pose = RobotPose(spec, model)

@@ -19,7 +19,8 @@ from cotap.envs.commands import STEADY_RAD
 from cotap.envs.reference import REST
 from cotap.evaluation.policy import Policy, load_policy
 from cotap.evaluation.quiet import quiet
-from cotap.play.controls import AXES, ROBOTS, Control, Ranges, make_controls
+from cotap.play import ROBOTS
+from cotap.play.controls import AXES, Control, Ranges, make_controls
 from cotap.play.forces import HandLoads, Push
 from cotap.play.sample import Sample, take_sample
 
