@@ -1,4 +1,8 @@
-"""Trains for a given time and samples memory and throughput: what grows, and what slows down. Stops by itself."""
+"""Trains for a given time and samples memory and throughput: what grows, and what slows down. Stops by itself.
+
+A machine's own speed comes and goes with what else runs on it. So the training is stopped now and then while the same
+work is timed each time, and what is judged is the training's throughput over that of this reference.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +14,19 @@ import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from cotap.envs import H1Env, H1EnvConfig
 
 FOREVER = 10**9
 MOST_GROWTH, MOST_SLOWDOWN = 0.01, 0.03
+REFERENCE_WORLDS, REFERENCE_STEPS = 256, 100
 
 
 def resident_mib(pid: int) -> float:
@@ -29,26 +38,83 @@ def resident_mib(pid: int) -> float:
     return int(kib) / 2**10
 
 
+class Reference:
+    """The same work every time: control steps of a small environment from one state, in this process."""
+
+    def __init__(self, threads: int) -> None:
+        if threads:
+            torch.set_num_threads(threads)
+        self._env = H1Env(H1EnvConfig(num_envs=REFERENCE_WORLDS, num_threads=threads))
+        self._env.reset()
+        self._begin = self._env.state_dict()
+        self._rest = torch.zeros(REFERENCE_WORLDS, len(self._env.spec.joints))
+
+    @torch.inference_mode()
+    def rate(self) -> float:
+        """Environment steps per second [1/s]."""
+        self._env.load_state_dict(self._begin)
+        begin = time.perf_counter()
+        for _ in range(REFERENCE_STEPS):
+            self._env.step(self._rest)
+        return REFERENCE_WORLDS * REFERENCE_STEPS / (time.perf_counter() - begin)
+
+
+@dataclass
+class Soaked:
+    """What a soak saw; times from its beginning [s]."""
+
+    memory: np.ndarray
+    """(S, 2) time, resident memory [MiB]."""
+    pauses: np.ndarray
+    """(P, 3) begin, end, rate of the reference in between [steps/s]; P may be 0."""
+    rates: np.ndarray
+    """(I, 2) end of each iteration, its throughput [steps/s]."""
+
+    def undisturbed(self) -> np.ndarray:
+        """(J, 2) `rates` of the iterations in which there was no pause."""
+        ends = self.rates[:, 0]
+        begins = np.concatenate([ends[:1] - (ends[1] - ends[0]), ends[:-1]])
+        met = [((self.pauses[:, 1] > b) & (self.pauses[:, 0] < e)).any() for b, e in zip(begins, ends, strict=True)]
+        return self.rates[~np.array(met)]
+
+    def relative(self) -> np.ndarray:
+        """(J,) throughput over that of the reference, as it was measured before and after (linear in between)."""
+        kept = self.undisturbed()
+        return kept[:, 1] / np.interp(kept[:, 0], self.pauses.mean(1, where=[True, True, False]), self.pauses[:, 2])
+
+
 def soak(
-    folder: Path, log_file: Path, stage: str, seconds: float, options: list[str], interval: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Train for `seconds`. Returns samples (S, 2) of time [s] and memory [MiB], and the throughput (I,) [steps/s]."""
+    folder: Path, log_file: Path, stage: str, seconds: float, options: list[str], interval: float, threads: int,
+    reference_every: float,
+) -> Soaked:  # fmt: skip
+    """Train for `seconds`; every `reference_every` seconds (0: never) the training waits for the reference."""
     command = [sys.executable, "-m", "cotap.train", stage, "--iterations", str(FOREVER), "--run-dir", str(folder)]
+    command += ["--threads", str(threads)]
+    reference = Reference(threads) if reference_every else None
     with log_file.open("w") as log:
         process = subprocess.Popen([*command, *options], stdout=log, stderr=subprocess.STDOUT)
-        start, samples = time.monotonic(), []
+        start, at, memory, pauses = time.monotonic(), time.time(), [], []
+        due = reference_every
         try:
             while (now := time.monotonic() - start) < seconds and process.poll() is None:
-                samples.append((now, resident_mib(process.pid)))
+                memory.append((now, resident_mib(process.pid)))
+                if reference and now >= due:
+                    process.send_signal(signal.SIGSTOP)
+                    rate = reference.rate()
+                    process.send_signal(signal.SIGCONT)
+                    pauses.append((now, time.monotonic() - start, rate))
+                    due = pauses[-1][1] + reference_every
                 time.sleep(interval)
         finally:
+            process.send_signal(signal.SIGCONT)
             process.send_signal(signal.SIGTERM)
             status = process.wait()
     if status:
         raise SystemExit(log_file.read_text())
     events = EventAccumulator(str(folder), size_guidance={"scalars": 0})
     events.Reload()
-    return np.array(samples), np.array([e.value for e in events.Scalars("throughput/steps_per_s")])
+    rates = [(e.wall_time - at, e.value) for e in events.Scalars("throughput/steps_per_s") if e.wall_time >= at]
+    return Soaked(np.array(memory), np.array(pauses).reshape(-1, 3), np.array(rates))
 
 
 def change(values: np.ndarray) -> float:
@@ -59,20 +125,32 @@ def change(values: np.ndarray) -> float:
     return float(np.median(fifths[4]) / np.median(fifths[1]) - 1.0)
 
 
-def plot(path: Path, samples: np.ndarray, rate: np.ndarray) -> None:
-    """Memory and throughput over time."""
+def trend(values: np.ndarray, seed: int = 0) -> tuple[float, list[float]]:
+    """`change`, and its 95 % interval by a bootstrap within the fifths."""
+    fifths, rng = np.array_split(values, 5), np.random.default_rng(seed)
+    medians = [np.median(rng.choice(fifths[i], (2000, len(fifths[i]))), axis=1) for i in (1, 4)]
+    return change(values), np.percentile(medians[1] / medians[0] - 1.0, [2.5, 97.5]).tolist()
+
+
+def plot(path: Path, soaked: Soaked) -> None:
+    """Memory and throughput over time, and throughput over that of the reference."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(2, 1, figsize=(9, 5), constrained_layout=True, sharex=True)
-    minutes = samples[:, 0] / 60.0
-    axes[0].plot(minutes, samples[:, 1], color="#2171b5")
+    rows = 3 if len(soaked.pauses) else 2
+    figure, axes = plt.subplots(rows, 1, figsize=(9, 2.4 * rows), constrained_layout=True, sharex=True)
+    axes[0].plot(soaked.memory[:, 0] / 60.0, soaked.memory[:, 1], color="#2171b5")
     axes[0].set_ylabel("resident memory [MiB]")
-    axes[1].plot(np.linspace(minutes[0], minutes[-1], len(rate)), rate, color="#2171b5", linewidth=0.7)
-    axes[1].set_ylabel("training [steps/s]")
-    axes[1].set_xlabel("time [min]")
+    axes[1].plot(soaked.rates[:, 0] / 60.0, soaked.rates[:, 1], color="#2171b5", linewidth=0.7, label="training")
+    axes[1].set_ylabel("[steps/s]")
+    if len(soaked.pauses):
+        axes[1].plot(soaked.pauses[:, 0] / 60.0, soaked.pauses[:, 2], ".", color="#e6550d", label="fixed reference")
+        axes[1].legend(loc="lower right")
+        axes[2].plot(soaked.undisturbed()[:, 0] / 60.0, soaked.relative(), ".", color="#2171b5", markersize=3)
+        axes[2].set_ylabel("training / reference")
+    axes[-1].set_xlabel("time [min]")
     for axis in axes:
         axis.set_ylim(bottom=0.0)
         axis.grid(alpha=0.3)
@@ -86,29 +164,38 @@ def main() -> int:
     parser.add_argument("--stage", choices=("base", "distill"), default="base")
     parser.add_argument("--run-dir", type=Path, help="keep the run here; by default it is thrown away")
     parser.add_argument("--interval", type=float, default=5.0, help="seconds between samples of memory")
+    parser.add_argument("--threads", type=int, default=0, help="of the training and the reference; 0: all")
+    parser.add_argument(
+        "--reference-every", type=float, default=45.0, help="seconds between looks at the machine's own speed; 0: never"
+    )
     parser.add_argument("--json", type=Path, help="write the figures here")
     parser.add_argument("--plot", type=Path, help="write the plot here (PNG)")
     parser.add_argument("options", nargs="*", help="options of the training, after --")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="cotap-soak-") as work:
-        samples, rate = soak(
+        soaked = soak(
             options.run_dir or Path(work) / "run", Path(work) / "log", options.stage, 60.0 * options.minutes,
-            options.options, options.interval,
+            options.options, options.interval, options.threads, options.reference_every,
         )  # fmt: skip
+    compared = soaked.relative() if len(soaked.pauses) else soaked.rates[:, 1]
+    slower, interval = trend(compared)
     result: dict[str, Any] = {
-        "minutes": samples[-1, 0] / 60.0,
-        "iterations": len(rate),
-        "memory_mib": float(np.median(samples[:, 1])),
-        "memory_growth": change(samples[:, 1]),
-        "steps_per_s": float(np.median(rate)),
-        "throughput_change": change(rate),
+        "minutes": soaked.memory[-1, 0] / 60.0,
+        "iterations": len(soaked.rates),
+        "memory_mib": float(np.median(soaked.memory[:, 1])),
+        "memory_growth": change(soaked.memory[:, 1]),
+        "steps_per_s": float(np.median(soaked.rates[:, 1])),
+        "throughput_change_as_the_clock_has_it": change(soaked.rates[:, 1]),
+        "references": len(soaked.pauses),
+        "throughput_change": slower,
+        "throughput_change_ci95": interval,
     }
     print(json.dumps(result, indent=2))
     if options.json:
         options.json.write_text(json.dumps(result, indent=2) + "\n")
     if options.plot:
-        plot(options.plot, samples, rate)
-    return int(result["memory_growth"] > MOST_GROWTH or result["throughput_change"] < -MOST_SLOWDOWN)
+        plot(options.plot, soaked)
+    return int(result["memory_growth"] > MOST_GROWTH or slower < -MOST_SLOWDOWN)
 
 
 if __name__ == "__main__":
