@@ -25,6 +25,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from cotap.envs import H1Env, H1EnvConfig
 
 FOREVER = 10**9
+RATE = "throughput/steps_per_s"
 MOST_GROWTH, MOST_SLOWDOWN = 0.01, 0.03
 REFERENCE_WORLDS, REFERENCE_STEPS = 256, 100
 
@@ -68,19 +69,24 @@ class Soaked:
     pauses: np.ndarray
     """(P, 3) begin, end, rate of the reference in between [steps/s]; P may be 0."""
     rates: np.ndarray
-    """(I, 2) end of each iteration, its throughput [steps/s]."""
+    """(I, 2) end of each iteration, steps/s of what it collected and learned."""
 
-    def undisturbed(self) -> np.ndarray:
-        """(J, 2) `rates` of the iterations in which there was no pause."""
-        ends = self.rates[:, 0]
-        begins = np.concatenate([ends[:1] - (ends[1] - ends[0]), ends[:-1]])
-        met = [((self.pauses[:, 1] > b) & (self.pauses[:, 0] < e)).any() for b, e in zip(begins, ends, strict=True)]
-        return self.rates[~np.array(met)]
+    def speeds(self) -> np.ndarray:
+        """(J, 2) time, iterations per second of wall time, whatever they were spent on.
 
-    def relative(self) -> np.ndarray:
-        """(J,) throughput over that of the reference, as it was measured before and after (linear in between)."""
-        kept = self.undisturbed()
-        return kept[:, 1] / np.interp(kept[:, 0], self.pauses.mean(1, where=[True, True, False]), self.pauses[:, 2])
+        With references: from each pause to the next, over the reference's rate in the first of them, and without the
+        iterations that a pause was in. So no two of them share a reading.
+        """
+        begins, ends = self.rates[:-1, 0], self.rates[1:, 0]
+        if not len(self.pauses):
+            return np.stack([ends, 1.0 / (ends - begins)], 1)
+        out = []
+        for (_, free, reference), stop in zip(self.pauses, [*self.pauses[1:, 0], np.inf], strict=True):
+            inside = (begins >= free) & (ends <= stop)
+            if inside.any():
+                speed = inside.sum() / (ends - begins)[inside].sum()
+                out.append((float(ends[inside].mean()), float(speed / reference)))
+        return np.array(out).reshape(-1, 2)
 
 
 def soak(
@@ -105,16 +111,18 @@ def soak(
                     pauses.append((now, time.monotonic() - start, rate))
                     due = pauses[-1][1] + reference_every
                 time.sleep(interval)
+            early = process.poll() is not None
         finally:
             process.send_signal(signal.SIGCONT)
             process.send_signal(signal.SIGTERM)
             status = process.wait()
-    if status:
-        raise SystemExit(log_file.read_text())
+    if status or early:
+        raise SystemExit(f"the training ended by itself, with status {status}:\n{log_file.read_text()}")
     events = EventAccumulator(str(folder), size_guidance={"scalars": 0})
     events.Reload()
-    rates = [(e.wall_time - at, e.value) for e in events.Scalars("throughput/steps_per_s") if e.wall_time >= at]
-    return Soaked(np.array(memory), np.array(pauses).reshape(-1, 3), np.array(rates))
+    known = RATE in events.Tags()["scalars"]
+    rates = [(e.wall_time - at, e.value) for e in (events.Scalars(RATE) if known else []) if e.wall_time >= at]
+    return Soaked(np.array(memory), np.array(pauses).reshape(-1, 3), np.array(rates).reshape(-1, 2))
 
 
 def change(values: np.ndarray) -> float:
@@ -148,7 +156,8 @@ def plot(path: Path, soaked: Soaked) -> None:
     if len(soaked.pauses):
         axes[1].plot(soaked.pauses[:, 0] / 60.0, soaked.pauses[:, 2], ".", color="#e6550d", label="fixed reference")
         axes[1].legend(loc="lower right")
-        axes[2].plot(soaked.undisturbed()[:, 0] / 60.0, soaked.relative(), ".", color="#2171b5", markersize=3)
+        times, speeds = soaked.speeds().T
+        axes[2].plot(times / 60.0, speeds / np.median(speeds), ".", color="#2171b5")
         axes[2].set_ylabel("training / reference")
     axes[-1].set_xlabel("time [min]")
     for axis in axes:
@@ -177,8 +186,7 @@ def main() -> int:
             options.run_dir or Path(work) / "run", Path(work) / "log", options.stage, 60.0 * options.minutes,
             options.options, options.interval, options.threads, options.reference_every,
         )  # fmt: skip
-    compared = soaked.relative() if len(soaked.pauses) else soaked.rates[:, 1]
-    slower, interval = trend(compared)
+    slower, interval = trend(soaked.speeds()[:, 1])
     result: dict[str, Any] = {
         "minutes": soaked.memory[-1, 0] / 60.0,
         "iterations": len(soaked.rates),
@@ -192,7 +200,8 @@ def main() -> int:
     }
     print(json.dumps(result, indent=2))
     if options.json:
-        options.json.write_text(json.dumps(result, indent=2) + "\n")
+        series = {name: getattr(soaked, name).tolist() for name in ("memory", "pauses", "rates")}
+        options.json.write_text(json.dumps(result | {"series": series}) + "\n")
     if options.plot:
         plot(options.plot, soaked)
     return int(result["memory_growth"] > MOST_GROWTH or slower < -MOST_SLOWDOWN)
