@@ -47,7 +47,7 @@ def test_what_is_not_shipped_is_a_row_that_says_so(book, monkeypatch):
     assert "not shipped" in rows[0]
     assert "0.861 / 0.101 / 46.664" in rows[0]  # the paper's own stay
     assert not book.results
-    rp.ablations(book, "mixture")
+    rp.ablations(book, "mixture", True)
     rp.periodic(book)
     rp.torque_observation(book)
     rp.fidelity(book, True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import re
 
@@ -153,22 +154,23 @@ def test_the_watchdog_names_what_it_stops_for(spec, default):
     def fresh():
         return Watchdog(SafetyConfig(), spec.joint_names, limit, 0.02)
 
-    assert fresh().reason(robot.read(), law) == ""
+    assert fresh().of_readings(robot.read()) == ""
     nan = robot.read().state.joint_vel.clone()
     nan[0, 3] = torch.nan
-    assert "reading is not finite" in fresh().reason(readings_of(robot, joint_vel=nan), law)
+    assert "reading is not finite" in fresh().of_readings(readings_of(robot, joint_vel=nan))
     bad = JointLaw(law.bias * np.nan, law.stiffness, law.damping)
-    assert "policy's output is not finite" in fresh().reason(robot.read(), bad)
+    assert fresh().of_law(law) == ""
+    assert "policy's output is not finite" in fresh().of_law(bad)
     down = torch.tensor([[0.9, 0.0, -0.436]], dtype=torch.float64)
-    assert "tilted by 1.12 rad" in fresh().reason(readings_of(robot, projected_gravity_t=down), law)
+    assert "tilted by 1.12 rad" in fresh().of_readings(readings_of(robot, projected_gravity_t=down))
     dog, torque = fresh(), np.zeros(19)
     torque[spec.joint_names.index("left_elbow")] = -limit[-5]
     for _ in range(49):
-        assert dog.reason(readings_of(robot, torque=torque), law) == ""
-    assert dog.reason(readings_of(robot, torque=0.9 * torque), law) == ""  # a breath, and counting starts anew
+        assert dog.of_readings(readings_of(robot, torque=torque)) == ""
+    assert dog.of_readings(readings_of(robot, torque=0.9 * torque)) == ""  # a breath, and counting starts anew
     for _ in range(49):
-        assert dog.reason(readings_of(robot, torque=torque), law) == ""
-    assert "left_elbow is at its torque limit for 1.00 s" in dog.reason(readings_of(robot, torque=torque), law)
+        assert dog.of_readings(readings_of(robot, torque=torque)) == ""
+    assert "left_elbow is at its torque limit for 1.00 s" in dog.of_readings(readings_of(robot, torque=torque))
 
 
 def test_a_policy_that_breaks_is_stopped_damped_and_counted(policy, spec):
@@ -191,6 +193,26 @@ def test_a_policy_that_breaks_is_stopped_damped_and_counted(policy, spec):
     assert np.isfinite(np.stack(trial.qpos)).all()
     assert trial.qpos[-1][2] < 0.8  # it sank
     assert np.abs(robot.engine.qvel).max() < 8.0  # and did not thrash
+
+
+def test_an_encoder_that_breaks_stops_the_robot_under_every_law(policy, spec, monkeypatch):
+    """One joint's angle is NaN from the eleventh reading on: before it gets to the law, which could not bear it."""
+    laws = UpperBodyConfig()
+    laws.left.name, laws.left.damping = "cotap", "critical"
+    robot, controller = make_robot(spec), make_controller(policy, spec, laws)
+    count, read = itertools.count(), robot.read
+
+    def broken() -> Readings:
+        readings = read()
+        if next(count) >= 10:
+            readings.state.joint_pos[0, spec.joint_names.index("left_elbow")] = torch.nan
+        return readings
+
+    monkeypatch.setattr(robot, "read", broken)
+    trial = run_trial(robot, controller, Scenario(2.0, command=(TimedCommand(stand=True),)), SafetyConfig(ramp_s=0.0))
+    assert trial.stopped == "a reading is not finite"
+    assert trial.stopped_at_s == pytest.approx(0.2)
+    assert np.isfinite(np.stack(trial.qpos)).all()
 
 
 def test_it_walks_where_it_is_told_and_feels_the_forces(policy, spec):

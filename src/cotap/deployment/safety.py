@@ -34,11 +34,11 @@ class SafetyConfig:
 
 
 class Watchdog:
-    """Looks at every reading and every law before the motors get it.
+    """Looks at every reading before the policy gets it, and at every law before the motors do, from when it is let go.
 
     Args:
         cfg: When to stop.
-        joints: (J) names, for the report.
+        joints: (J,) names, for the report.
         torque_limit: (J,) [Nm].
         dt: Control step [s].
     """
@@ -46,23 +46,25 @@ class Watchdog:
     def __init__(self, cfg: SafetyConfig, joints: tuple[str, ...], torque_limit: np.ndarray, dt: float) -> None:
         cfg.check()
         self._cfg, self._joints, self._limit, self._dt = cfg, joints, torque_limit, dt
-        self._saturated_s = np.zeros(len(joints))
+        self._saturated_s = np.zeros(len(self._joints))
 
-    def reason(self, readings: Readings, law: JointLaw) -> str:
+    def of_readings(self, readings: Readings) -> str:
         """Why to stop now; empty while all is well. To be asked once a control step."""
         s = readings.state
         sensed = torch.cat((s.joint_pos, s.joint_vel, s.projected_gravity_t, s.torso_angular_velocity_t), 1)
         if not (torch.isfinite(sensed).all() and np.isfinite(readings.torque).all()):
             return "a reading is not finite"
-        if not all(np.isfinite(part).all() for part in (law.bias, law.stiffness, law.damping)):
-            return "the policy's output is not finite"
         tilt = float(torch.acos((-s.projected_gravity_t[0, 2]).clamp(-1.0, 1.0)))
         if tilt > self._cfg.max_tilt:
             return f"the torso is tilted by {tilt:.2f} rad"
         at_limit = np.abs(readings.torque) > 0.999 * self._limit
         self._saturated_s = np.where(at_limit, self._saturated_s + self._dt, 0.0)
-        if (worst := int(self._saturated_s.argmax())) >= 0 and self._saturated_s[
-            worst
-        ] >= self._cfg.saturation_s - 1e-9:
+        worst = int(self._saturated_s.argmax())
+        if self._saturated_s[worst] >= self._cfg.saturation_s - 1e-9:
             return f"{self._joints[worst]} is at its torque limit for {self._saturated_s[worst]:.2f} s"
         return ""
+
+    def of_law(self, law: JointLaw) -> str:
+        """Why to stop instead of sending this to the motors; empty if it can be sent."""
+        finite = all(np.isfinite(part).all() for part in (law.bias, law.stiffness, law.damping))
+        return "" if finite else "the policy's output is not finite"

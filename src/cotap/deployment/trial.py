@@ -30,7 +30,7 @@ class Trial:
 
     dt: float
     rows: list[dict[str, torch.Tensor]] = field(default_factory=list)
-    """Fields of a `Trajectory`, (1, ...) each, and `torque` (1, J)."""
+    """Fields of a `Trajectory`, (1, ...) each."""
     qpos: list[np.ndarray] = field(default_factory=list)
     """(T) of (7 + J,)."""
     stopped: str = ""
@@ -78,14 +78,16 @@ def run_trial(
             commands.pop(0).give(controller.commands, robot.spec.nominal_height_m)
         if pilot and not pilot(controller, k * dt):
             break
-        readings = robot.read()
-        law = controller.step(readings)
+        law = damped_law(robot.damping)
         if not trial.stopped:
-            trial.stopped = watchdog.reason(readings, law)
+            readings = robot.read()
+            trial.stopped = watchdog.of_readings(readings)
+            if not trial.stopped:
+                asked = controller.step(readings)
+                trial.stopped = watchdog.of_law(asked)
+                law = law if trial.stopped else asked
             if trial.stopped:
                 trial.stopped_at_s = k * dt
-        if trial.stopped:
-            law = damped_law(robot.damping)
         push = sum(
             (f.at(torch.tensor([k * dt]))[0, :-1].double().numpy() for f in forces), np.zeros((len(robot.spec.arms), 3))
         )
@@ -139,7 +141,6 @@ def _row(
         "foot_height": s.foot_pos_w[:, :, 2],
         "path_error": torch.full_like(s.height, math.nan),
         "fell": torch.tensor([fell]),
-        "torque": torque,
     }
 
 
@@ -150,8 +151,6 @@ def trajectory(trials: list[Trial], steps: int) -> Trajectory:
         rows = trial.rows[:steps]
         rows = rows + [rows[-1] | {"fell": torch.tensor([True])}] * (steps - len(rows))
         for name in rows[0]:
-            if name == "torque":
-                continue
             value = torch.stack([row[name] for row in rows])
             columns.setdefault(name, []).append(value if value.dtype == torch.bool else value.float())
     return Trajectory(trials[0].dt, **{name: torch.cat(values, 1) for name, values in columns.items()})
