@@ -1,6 +1,7 @@
 """Every table and figure of the paper from the shipped checkpoints, as Markdown, JSON and PNG, beside the paper's own.
 
-`--quick` takes fewer worlds and writes to runs/paper-quick; without it, docs/results.md and docs/results/ are written.
+`--quick` takes fewer worlds and writes to runs/paper-quick, `--only` takes parts and writes to runs/paper; without
+them, docs/results.md and docs/results/ are written.
 """
 
 from __future__ import annotations
@@ -643,7 +644,12 @@ def main() -> int:
     parser.add_argument("--num-envs", type=int, default=0, help="worlds a row; 4096, or 128 with --quick")
     parser.add_argument("--threads", type=int, default=0, help="0 takes every processor")
     parser.add_argument("--motion", default="mixture", help="the arms' reference in the impact tables")
-    parser.add_argument("--out", type=Path, default=None, help="folder of results.md; docs, or runs/paper-quick")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=None,
+        help="folder of results.md; docs, with --only runs/paper",
+    )
     parser.add_argument("--reuse", action="store_true", help="keep evaluations that are there already")
     parser.add_argument("--only", nargs="*", default=[], help=f"parts: {', '.join(PARTS)}")
     options = parser.parse_args()
@@ -652,7 +658,8 @@ def main() -> int:
         parser.error(f"--only {unknown[0]!r} is unknown; parts: {', '.join(PARTS)}")
     if sys.platform == "linux":
         os.environ.setdefault("MUJOCO_GL", "egl" if Path("/dev/dri").exists() else "osmesa")
-    folder = options.out or Path("runs/paper-quick" if options.quick else "docs")
+    # A part alone is no page to put in the place of the whole one.
+    folder = options.out or Path("runs/paper-quick" if options.quick else "runs/paper" if options.only else "docs")
     out = folder / "results"
     evaluations = Path("runs/paper-quick" if options.quick else "runs/paper") / "evaluations"
     for path in (out, evaluations):
@@ -672,8 +679,8 @@ Written by `{command}`: do not edit. {envs} worlds a row unless said otherwise; 
 intervals over the worlds that stood (shares of falls: all worlds, to the end of the episode, Wilson's). Impact: 500 N
 for 50 ms at the left hand, +x in stance, in a random horizontal direction while walking at 0.5 m/s; window 1 s from the
 onset at 1 s of 3 s; friction, masses, gains and delay randomised; H1's own torque limits unless a factor is
-named. The paper's figures (Isaac Gym, 4096 worlds, window and torque limits not given) stand beside ours: orderings and
-ratios are what compares, not digits.
+named. In other simulators: [sim to sim](sim_to_sim.md). The paper's figures (Isaac Gym, 4096 worlds, window and torque
+limits not given) stand beside ours: orderings and ratios are what compares, not digits.
 """
 
 
@@ -725,7 +732,12 @@ def write(folder: Path, book: Book) -> None:
         "effective_stiffness",
         "by_change",
     )
-    write_json(folder / "results.json", {n: {k: r[k] for k in kept if k in r} for n, r in book.results.items()})
+    results = {
+        name: {key: result[key] for key in kept if key in result}
+        | {"settings": {key: value for key, value in result["settings"].items() if key != "env"}}
+        for name, result in book.results.items()
+    }  # the environment is in the checkpoint
+    write_json(folder / "results.json", results)
     print(f"\nwritten: {folder / 'results.md'}")
 
 

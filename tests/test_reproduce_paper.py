@@ -11,6 +11,11 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 import reproduce_paper as rp
 
+from cotap.agents.checkpoint import sha256
+from cotap.evaluation.policy import shipped_checkpoint
+
+OWN = sha256(shipped_checkpoint("base"))
+
 
 @pytest.fixture
 def book(tmp_path: Path) -> rp.Book:
@@ -71,10 +76,30 @@ def test_the_papers_tables_have_seven_rows_each():
 
 def test_page_and_json_are_written(book, tmp_path):
     book.add("# Title")
-    book.results["x"] = measured(1.0, 0.1) | {"curve": [1] * 1000}
+    book.results["x"] = measured(1.0, 0.1) | {"curve": [1] * 1000, "settings": {"seed": 7, "env": {"robot": "h1"}}}
     rp.write(tmp_path, book)
     assert (tmp_path / "results.md").read_text() == "# Title\n"
-    assert json.loads((tmp_path / "results.json").read_text())["x"].keys() == {"metrics_without_falls"}
+    written = json.loads((tmp_path / "results.json").read_text())["x"]
+    assert written.keys() == {"metrics_without_falls", "settings"}
+    assert written["settings"] == {"seed": 7}
+
+
+def test_only_evaluations_of_the_same_policy_and_size_are_kept(book, monkeypatch):
+    """Neither one of another checkpoint nor one of other worlds is taken for what was asked for."""
+    asked = []
+
+    def evaluate(arguments):
+        asked.append(arguments)
+        return {"num_envs": book.envs}
+
+    monkeypatch.setattr("cotap.evaluate.evaluate", evaluate)
+    book.reuse = True
+    path = book.evaluations / "row.json"
+    for sha, worlds, kept in (("other", book.envs, False), (OWN, book.envs + 1, False), (OWN, book.envs, True)):
+        asked.clear()
+        path.write_text(json.dumps({"num_envs": worlds, "settings": {"checkpoint_sha256": sha}}))
+        book.run("row", "base", "impact")
+        assert (not asked) == kept
 
 
 @pytest.mark.slow

@@ -311,20 +311,24 @@ def figure(result: dict[str, Any], path: Any) -> None:
     import matplotlib.pyplot as plt
 
     engines = result["engines"]
-    fig, axes = plt.subplots(len(engines), 3, figsize=(15, 3.6 * len(engines)), constrained_layout=True, squeeze=False)
-    for row, (name, e) in zip(axes, engines.items(), strict=True):
-        for axis, part in zip(row, ("impact", "constant-load"), strict=False):
+    fig, axes = plt.subplots(3, len(engines), figsize=(4.6 * len(engines), 9.0), constrained_layout=True, squeeze=False)
+    for column, (name, e) in zip(axes.T, engines.items(), strict=True):
+        for axis, part in zip(column, ("impact", "constant-load"), strict=False):
             for label, law in e[part].items():
                 axis.plot(result["dt"] * np.arange(len(law["curve"])) - 0.5, law["curve"], label=label, lw=1.2)
             axis.set(title=f"{name}, {part}", xlabel="time since the onset [s]", ylabel="error of the hand hit [m]")
-            axis.legend(frameon=False, fontsize=7)
-        p, axis = e["periodic-load"], row[2]
-        for side, color in (("left", "#2171b5"), ("right", "#d95f02")):
-            law = "alpha 0.7, 500 N/m" if side == "left" else "PD"
-            axis.plot(p["time"], p["arms"][side].get("torque", []), color=color, lw=1.2, label=f"{side}, {law}")
-        axis.set(title=f"{name}, periodic load", xlabel="time [s]", ylabel="elbow torque [Nm]")
-        axis.legend(frameon=False, fontsize=7)
-        for axis in row:
+        column[0].legend(frameon=False, fontsize=9)
+        p, axis = e["periodic-load"], column[2]
+        styles = (("right", "PD", "#d95f02", "-"), ("left", "alpha 0.7, 500 N/m", "#2171b5", "--"))
+        for side, law, color, style in styles:  # the second, dashed, lets the first be seen
+            torque, statics = p["arms"][side].get("torque", []), p["arms"][side]["elbow_torque_statics_nm"]
+            axis.plot(p["time"], torque, style, color=color, lw=1.4, label=f"{side}, {law}")
+            for end in (-1.0, 1.0) if torque else ():
+                axis.axhline(np.mean(torque) + end * statics, color="0.4", ls=":", lw=1.0)
+        axis.set(title=f"{name}, periodic load; dotted: statics", xlabel="time [s]", ylabel="elbow torque [Nm]")
+        axis.set_ylim(-13.0, 17.0)
+        axis.legend(frameon=False, fontsize=9, loc="upper right")
+        for axis in column:
             axis.grid(alpha=0.2)
     fig.savefig(path, dpi=130, format="png")
     plt.close(fig)
