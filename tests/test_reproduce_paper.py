@@ -63,10 +63,11 @@ def test_what_is_not_shipped_is_a_row_that_says_so(book, monkeypatch):
 def test_an_error_without_bound_is_the_largest(book, monkeypatch):
     rows = [{"axis": "x", "error": -0.3, "n": 4}, {"axis": "y", "error": None, "n": 4},
             {"axis": "z", "error": None, "n": 0}]  # fmt: skip
-    result = {"fidelity": rows, "num_wrong_way": 3, "coverage": 0.5, "num_falls": 1, "num_envs": 12}
+    result = {"fidelity": rows, "num_wrong_way": 3, "coverage": 0.5, "num_falls": 1, "num_envs": 12,
+              "error_quantiles": {"50": 0.021, "95": 0.15}}  # fmt: skip
     monkeypatch.setattr(book, "run", lambda *_, **__: result)
     rp.fidelity(book, True)
-    assert "| cotap | joint | no bound | 30% / no bound / - | 3 | 50% | 1 of 12 |" in book.lines
+    assert "| cotap | joint | no bound | 30% / no bound / - | 2.1%, 15% | 3 | 50% | 1 of 12 |" in book.lines
 
 
 def test_the_papers_tables_have_seven_rows_each():
