@@ -65,6 +65,14 @@ def test_paused_it_stands_still_but_for_single_steps_and_reset_starts_over(app):
     app.advance()
     app.advance()
     assert app.session.num_steps == before + 1
+    for _ in range(3):
+        app.mailbox.ask(Step())
+    app.advance()
+    assert app.session.num_steps == before + 4
+    app.archive.filming.set()
+    app.mailbox.ask(Step())
+    app.advance()
+    assert app.session.num_steps == before + 4
     app.mailbox.ask(Reset())
     app.advance()
     assert int(app.session.env.episode_length_buf[0]) == 0

@@ -91,19 +91,19 @@ class App:
                 self.notices.tell(text, title=f"robot {robot.upper()}: another gait")
         if "side_by_side" in values:
             self._keep_recording()
-        step = False
         for request in requests:
             if isinstance(request, Push):
                 self.session.push(request)
             elif isinstance(request, Reset):
                 self.session.reset()
             elif isinstance(request, Step):
-                step = True
+                if self.session.values["paused"] and not self.archive.filming.is_set():
+                    self._step()
             elif request.on:
                 self._begin_recording()
             else:
                 self._keep_recording()
-        if (self.session.values["paused"] and not step) or self.archive.filming.is_set():
+        if self.session.values["paused"] or self.archive.filming.is_set():
             self.pace.rest()
             return
         self._step()
