@@ -11,6 +11,7 @@ import viser
 
 from cotap.play import ROBOTS
 from cotap.play.archive import Archive
+from cotap.play.controls import Refused
 from cotap.play.forces import Push
 from cotap.play.mailbox import Mailbox, Record, Reset, Step
 from cotap.play.notices import Notices
@@ -52,6 +53,7 @@ class App:
         self._failure: BaseException | None = None
         self._recorder: Recorder | None = None
         self._changes: dict[str, Any] = {}
+        self._told: set[str] = set()
         self._latest: tuple[int, Sample] | None = None
         with server.atomic():
             self.panel = Panel(server, self.mailbox, session.sides, self.notices)
@@ -208,11 +210,17 @@ class App:
         if event.instance_index is None:
             return
         robot, hand = divmod(event.instance_index, len(self.session.sides))
+        name = f"{ROBOTS[robot]}.{self.session.sides[hand]}.drag"
+        if event.phase == "start":
+            self._told.discard(name)
         point = None if event.phase == "end" else self.scene.to_robot(event.end_position, robot)
         try:
-            self.mailbox.set(f"{ROBOTS[robot]}.{self.session.sides[hand]}.drag", point)
-        except ValueError as error:
-            self.notices.tell(str(error), event.client, "refused")
+            _, notice = self.mailbox.set(name, point)
+        except Refused as refusal:
+            notice = str(refusal)
+        if notice and name not in self._told:  # a drag is many events: its first notice stands for all
+            self._told.add(name)
+            self.notices.tell(notice, event.client, "not as sent")
 
     def _begin_recording(self) -> None:
         if self._recorder is None:
