@@ -148,10 +148,13 @@ class App:
             if now >= due["status"]:
                 due["status"] = now + 1.0 / STATUS_HZ
                 self._show_status()
-            if self.archive.filming.is_set():
+            if not self.archive.drawing.acquire(blocking=False):
                 continue
-            self.scene.shown = self._shown()
-            self.scene.show(latest[1])
+            try:
+                self.scene.shown = self._shown()
+                self.scene.show(latest[1])
+            finally:
+                self.archive.drawing.release()
             if now >= due["plots"] and latest is not drawn and self._live_plots.value:
                 due["plots"] = now + 1.0 / PLOT_HZ
                 self.plots.draw(self._shown())
