@@ -115,6 +115,10 @@ class Ranges:
     checkpoints: tuple[str, ...]
 
 
+SPEED = Number("speed", 0.1, 4.0, 1.0, 0.1)
+"""How many times as fast as the clock."""
+
+
 def make_controls(r: Ranges) -> dict[str, Control]:
     """Every control by name: `velocity_x`, `held.left.z`, `a.left.stiffness_x`, ..."""
     controls: dict[str, Control] = {
@@ -125,7 +129,7 @@ def make_controls(r: Ranges) -> dict[str, Control]:
         "stand": Flag("stand", True),
         "motion": Choice("arm motion", r.motions, r.motions[0]),
         "arm_actions": Flag("policy moves arms", True),
-        "speed": Number("speed", 0.1, 4.0, 1.0, 0.1),
+        "speed": SPEED,
         "paused": Flag("paused", False),
         "side_by_side": Flag("side by side", False),
         "push.hand": Choice("hand", r.sides, r.sides[0]),
