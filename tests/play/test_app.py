@@ -249,4 +249,7 @@ def test_what_cannot_be_shown_is_refused_before_anything_runs(free_port, tmp_pat
     assert main(["--port", str(free_port), "--robot", "atlas"]) == 2
     err = capsys.readouterr().err
     assert "none.npz" in err
+    for option in ("robot", "checkpoint"):
+        assert main(["--port", str(free_port), "--replay", str(tmp_path / "none.npz"), f"--{option}", "h1"]) == 2
+        assert "leave out --robot and --checkpoint with --replay" in capsys.readouterr().err
     assert "none.pt" in err
