@@ -48,6 +48,7 @@ def main() -> int:
     if evaluate([*film, "--checkpoint", str(cotap), "--video", str(OUT / "impact.mp4")]):
         print("no video on this machine; everything else is there")
     print(f"look at {OUT}: " + ", ".join(sorted(p.name for p in OUT.iterdir())))
+    print("and push the robot yourself: .venv/bin/python -m cotap.play, then open http://localhost:8080")
     return 0
 
 

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from viser import ViserServer
 
 from cotap.evaluation.policy import shipped_checkpoint
+from cotap.evaluation.recording import Recording
+from cotap.play.forces import Push
+from cotap.play.recorder import Recorder
+from cotap.play.server import open_server
 from cotap.play.session import Session
 
 
@@ -30,3 +35,25 @@ def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]
+
+
+@pytest.fixture
+def server(free_port: int) -> Iterator[ViserServer]:
+    server = open_server("127.0.0.1", free_port)
+    yield server
+    server.stop()
+
+
+@pytest.fixture
+def record(session: Session) -> Callable[..., Recording]:
+    """Records some steps of the first robots, both of them with the left hand pushed, robot b under PD."""
+
+    def make(steps: int, count: int) -> Recording:
+        recorder = Recorder(session.dt, count, session.describe())
+        session.set({"b.left.law": "pd"})
+        session.push(Push("left", (40.0, 0.0, 0.0), 1.0))
+        for _ in range(steps):
+            recorder.append(session.step(), {})
+        return recorder.finish()
+
+    return make

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import socket
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -55,6 +57,46 @@ def test_the_page_shows_what_was_accepted_not_what_was_sent(app):
     assert float(app.session.env.upper_body.parameters.alpha[0, 0]) == 1.0
 
 
+@pytest.fixture
+def told(app, monkeypatch):
+    notices = []
+    monkeypatch.setattr(app.notices, "tell", lambda text, *_, **__: notices.append(text))
+    return notices
+
+
+def test_a_push_is_made_of_what_was_accepted_and_people_are_told_what_was_not(app, told):
+    shown = app.panel._handles
+    for name, sent, used in (
+        ("hand", "right", "right"), ("hand", "head", "right"), ("force", 1e9, 600.0), ("force", float("nan"), 600.0),
+        ("seconds", 99.0, 5.0), ("seconds", 0.1, 0.1),
+    ):  # fmt: skip
+        before = len(told)
+        shown[f"push.{name}"]._impl.value = sent  # as a browser's message does
+        app.panel._set(f"push.{name}", sent, None)
+        assert shown[f"push.{name}"].value == used
+        assert len(told) - before == (sent != used)
+    assert app.panel._push((0.0, 0.0, -1.0)) == Push("right", (0.0, 0.0, -600.0), 0.1)
+
+
+def test_of_a_drag_out_of_reach_people_are_told_once(app, told):
+    def drag(phase, *point):
+        event = SimpleNamespace(instance_index=1, phase=phase, end_position=point, client=None)
+        asyncio.run(app._drag(event))
+
+    for _ in range(2):
+        drag("start", 0.0, 0.0, 1.0)
+        for _ in range(20):
+            drag("update", 1e9, 0.0, 1.0)
+            drag("update", float("nan"), 0.0, 1.0)
+        app.advance()
+        assert app.session.values["a.right.drag"] == (1e3, 0.0, 1.0)
+        drag("end", 0.0, 0.0, 1.0)
+    assert len(told) == 2
+    assert "drag 1e+09 is outside" in told[0]
+    app.advance()
+    assert app.session.values["a.right.drag"] is None
+
+
 def test_paused_it_stands_still_but_for_single_steps_and_reset_starts_over(app):
     app.advance()
     app.mailbox.set("paused", True)
@@ -65,6 +107,14 @@ def test_paused_it_stands_still_but_for_single_steps_and_reset_starts_over(app):
     app.advance()
     app.advance()
     assert app.session.num_steps == before + 1
+    for _ in range(3):
+        app.mailbox.ask(Step())
+    app.advance()
+    assert app.session.num_steps == before + 4
+    app.archive.filming.set()
+    app.mailbox.ask(Step())
+    app.advance()
+    assert app.session.num_steps == before + 4
     app.mailbox.ask(Reset())
     app.advance()
     assert int(app.session.env.episode_length_buf[0]) == 0
@@ -199,4 +249,7 @@ def test_what_cannot_be_shown_is_refused_before_anything_runs(free_port, tmp_pat
     assert main(["--port", str(free_port), "--robot", "atlas"]) == 2
     err = capsys.readouterr().err
     assert "none.npz" in err
+    for option in ("robot", "checkpoint"):
+        assert main(["--port", str(free_port), "--replay", str(tmp_path / "none.npz"), f"--{option}", "h1"]) == 2
+        assert "leave out --robot and --checkpoint with --replay" in capsys.readouterr().err
     assert "none.pt" in err

@@ -12,8 +12,8 @@ from cotap.play.lean import uncollected
 
 LOADED = """
 import sys
-import cotap.play.__main__, cotap.play.server
-assert "torch" not in sys.modules, "the page answers before torch is loaded"
+import cotap.play.__main__, cotap.play.server, cotap.play.scene
+assert "torch" not in sys.modules, "the page answers, and shows the robot, before torch is loaded"
 import torch.compiler
 told = torch.compiler.allow_in_graph, torch.compiler.assume_constant_result
 from cotap.play.lean import import_tensordict

@@ -10,7 +10,6 @@ import pytest
 from cotap.play.controls import Choice, Flag, Number, Point, Refused
 from cotap.play.forces import Push
 from cotap.play.mailbox import QUEUE, Mailbox, Reset, Step
-from cotap.play.panel import make_push
 
 CONTROLS = {
     "k": Number("K_ee x [N/m]", 50.0, 1500.0, 300.0, 10.0),
@@ -86,8 +85,9 @@ def test_pushes_that_cannot_be_are_refused(push):
     assert mailbox.take()[1] == []
 
 
-def test_a_push_is_made_of_what_the_fields_hold():
-    assert make_push(("left", "right"), "right", 1e9, 0.5, (0.0, 0.0, -1.0)) == Push("right", (0.0, 0.0, -600.0), 0.5)
-    for side, force, seconds in (("head", 10.0, 0.5), ("left", math.nan, 0.5), ("left", 10.0, "long")):
-        with pytest.raises(Refused):
-            make_push(("left", "right"), side, force, seconds, (1.0, 0.0, 0.0))
+def test_a_point_out_of_reach_is_moved_and_told_so():
+    mailbox = Mailbox(CONTROLS)
+    assert mailbox.set("drag", (1.0, -2.0, 3.0)) == ((1.0, -2.0, 3.0), None)
+    point, notice = mailbox.set("drag", (1.0, 2.0, -1e9))
+    assert point == (1.0, 2.0, -10.0)
+    assert "drag -1e+09 is outside [-10, 10]" in notice

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import math
 import shutil
 import threading
 import time
@@ -11,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from viser._messages import GuiUpdateMessage
 
 from cotap.evaluation.policy import shipped_checkpoint
 from cotap.play import ROBOTS
@@ -47,10 +50,29 @@ class Page:
 
     def number(self, label: str, value: float | str, nth: int = 0) -> None:
         """Type a value into the number box beside the slider of this label, the nth one on the page."""
-        row = self.page.get_by_text(label, exact=True).nth(nth)
-        box = row.locator("xpath=ancestor::*[.//input][1]").locator("input").last
+        box = self.box(label, nth)
         box.fill(str(value))
         box.press("Enter")
+
+    def box(self, label: str, nth: int = 0) -> Any:
+        """That number box."""
+        row = self.page.get_by_text(label, exact=True).nth(nth)
+        return row.locator("xpath=ancestor::*[.//input][1]").locator("input").last
+
+    def second_viewer(self) -> Any:
+        """The same page once more in the browser."""
+        other = self.page.context.new_page()
+        other.goto(self.page.url)
+        other.get_by_text("control steps/s").wait_for(timeout=1000.0 * PATIENCE_S)
+        self.until("two viewers", lambda: len(self.app.server.get_clients()) == 2)
+        return other
+
+    def send(self, handle: Any, value: float) -> None:
+        """What a message of the newest viewer does, with a value that no box lets through; all others are told it."""
+        server = self.app.server
+        message = GuiUpdateMessage(handle._impl.uuid, {"value": value})
+        handled = server.gui._handle_gui_updates(max(server.get_clients()), message)
+        asyncio.run_coroutine_threadsafe(handled, server.get_event_loop()).result(PATIENCE_S)
 
     def until(self, what: str, happened: Callable[[], bool]) -> None:
         """Wait for the simulation to have something; the test fails if it never does."""
@@ -121,8 +143,14 @@ def test_a_walk_through_the_page(page: Page, tmp_path: Path):
 
     page.page.get_by_label("side by side").click()
     page.until("two robots", lambda: page.app.scene.shown == 2)
+    page.page.get_by_label("paused").click()
+    page.until("it stands still", lambda: session.values["paused"])
+    sim = session.env.sim
+    assert not np.allclose(sim.qpos[0], sim.qpos[1], atol=1e-3)  # their left arms are under different laws
     page.button("Reset")
-    page.until("both in one state", lambda: int(session.env.episode_length_buf[0]) < 50)
+    page.until("both in one state", lambda: bool((sim.qpos[0] == sim.qpos[1]).all()))
+    assert int(session.env.episode_length_buf[0]) == 0
+    page.page.get_by_label("paused").click()
     page.tab("Record")
     page.button("Start recording")
     page.until("it is recording", lambda: page.app._recorder is not None and page.app._recorder.seconds > 1.0)
@@ -135,11 +163,7 @@ def test_a_walk_through_the_page(page: Page, tmp_path: Path):
 
 
 def test_several_viewers_and_one_that_leaves_do_not_stop_it(page: Page):
-    other = page.page.context.new_page()
-    other.goto(page.page.url)
-    other.get_by_text("control steps/s").wait_for(timeout=1000.0 * PATIENCE_S)
-    page.until("two viewers", lambda: len(page.app.server.get_clients()) == 2)
-    other.close()
+    page.second_viewer().close()
     page.until("one viewer", lambda: len(page.app.server.get_clients()) == 1)
     steps = page.app.session.num_steps
     page.until("it goes on", lambda: page.app.session.num_steps > steps + 10)
@@ -150,8 +174,25 @@ def test_a_flood_of_settings_is_survived_and_never_leaves_its_range(page: Page):
     page.tab("Walk")
     for value in [*range(-50, 50, 5), "1e400", "-"]:
         page.number("forward [m/s]", value)
-    steps = page.app.session.num_steps
-    page.until("it goes on", lambda: page.app.session.num_steps > steps + 10)
-    low, high = (getattr(page.app.session.controls["velocity_x"], end) for end in ("low", "high"))
-    assert low <= page.app.session.values["velocity_x"] <= high
+    session, handle = page.app.session, page.app.panel._handles["velocity_x"]
+    low, high = (getattr(session.controls["velocity_x"], end) for end in ("low", "high"))
+    page.number("forward [m/s]", 0.2)
+    page.until("the last of them counts", lambda: session.values["velocity_x"] == 0.2)
+    other = page.second_viewer()
+    for _ in range(50):
+        for value in (math.inf, -math.inf, math.nan):
+            page.send(handle, value)
+            assert handle.value == 0.2
+    other.get_by_text("forward [m/s] must be a finite number").first.wait_for()
+    page.until("it is shown as it was", lambda: float(page.box("forward [m/s]").input_value()) == 0.2)
+    page.send(handle, 1e300)
+    page.until("it is moved to the end of its range", lambda: session.values["velocity_x"] == high)
+    page.until("it is shown so", lambda: float(page.box("forward [m/s]").input_value()) == high)
+    for value in (-1e300, 1e300) * 20:
+        page.send(handle, value)
+        assert low <= handle.value <= high
+    steps = session.num_steps
+    page.until("it goes on", lambda: session.num_steps > steps + 10)
+    assert low <= session.values["velocity_x"] <= high
     assert np.isfinite(page.app._latest[1]["qpos"]).all()
+    assert page.complaints == []

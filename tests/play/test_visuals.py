@@ -30,6 +30,17 @@ def test_bodies_are_where_mujoco_has_them_and_standing_feet_touch_the_floor(spec
     assert np.abs(contacts[:, 2]).max() < 0.02
 
 
+def test_an_arm_that_touches_the_torso_is_a_contact(spec):
+    pose = RobotPose(spec, visual_model(spec)[0])
+    qpos = np.r_[0.0, 0.0, 5.0, 1.0, 0.0, 0.0, 0.0, [j.default_rad for j in spec.joints]]
+    assert len(pose.of(qpos)[2]) == 0
+    (roll,) = spec.indices(["left_shoulder_roll"])
+    qpos[7 + roll] = spec.joints[roll].range_rad[0]
+    contacts = pose.of(qpos)[2]
+    assert len(contacts) > 0
+    assert contacts[:, 2].min() > 5.0
+
+
 def test_meshes_are_taken_from_menageries_cache_when_they_are_there(spec, tmp_path, monkeypatch):
     pytest.importorskip("mujoco_menagerie", reason="meshes need the mujoco-menagerie package")
     monkeypatch.delenv("MENAGERIE_ROOT", raising=False)

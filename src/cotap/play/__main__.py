@@ -31,8 +31,8 @@ class PlayOptions:
     """Port to listen at."""
     checkpoint: tuple[str, ...] = ()
     """Checkpoints to choose from beside the shipped ones; the first of these runs at first."""
-    robot: str = "h1"
-    """Robot whose policies these are."""
+    robot: str = ""
+    """Robot whose policies these are; h1 where none is given. A recording has its own."""
     replay: str = ""
     """Show this recording (.npz) instead of simulating."""
     output: str = "runs/play"
@@ -56,6 +56,8 @@ def main(argv: list[str] | None = None) -> int:
 
 def _run(options: PlayOptions) -> int:
     begin = time.perf_counter()
+    if options.replay and (options.robot or options.checkpoint):
+        raise ValueError("a recording has its own robot and policies: leave out --robot and --checkpoint with --replay")
     try:
         with uncollected():
             from cotap.play.server import open_server
@@ -80,8 +82,9 @@ def _live(options: PlayOptions, server: ViserServer) -> App:
     from cotap.play.scene import Scene
     from cotap.robots import ROBOTS as KNOWN_ROBOTS
 
-    require_one_of("robot", options.robot, KNOWN_ROBOTS)
-    scene = Scene(server, KNOWN_ROBOTS[options.robot](), len(ROBOTS))
+    robot = options.robot or "h1"
+    require_one_of("robot", robot, KNOWN_ROBOTS)
+    scene = Scene(server, KNOWN_ROBOTS[robot](), len(ROBOTS))
     server.flush()  # browsers prepare it while the rest is loaded
 
     import torch

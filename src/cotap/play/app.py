@@ -11,6 +11,7 @@ import viser
 
 from cotap.play import ROBOTS
 from cotap.play.archive import Archive
+from cotap.play.controls import Refused
 from cotap.play.forces import Push
 from cotap.play.mailbox import Mailbox, Record, Reset, Step
 from cotap.play.notices import Notices
@@ -52,6 +53,7 @@ class App:
         self._failure: BaseException | None = None
         self._recorder: Recorder | None = None
         self._changes: dict[str, Any] = {}
+        self._told: set[str] = set()
         self._latest: tuple[int, Sample] | None = None
         with server.atomic():
             self.panel = Panel(server, self.mailbox, session.sides, self.notices)
@@ -91,19 +93,19 @@ class App:
                 self.notices.tell(text, title=f"robot {robot.upper()}: another gait")
         if "side_by_side" in values:
             self._keep_recording()
-        step = False
         for request in requests:
             if isinstance(request, Push):
                 self.session.push(request)
             elif isinstance(request, Reset):
                 self.session.reset()
             elif isinstance(request, Step):
-                step = True
+                if self.session.values["paused"] and not self.archive.filming.is_set():
+                    self._step()
             elif request.on:
                 self._begin_recording()
             else:
                 self._keep_recording()
-        if (self.session.values["paused"] and not step) or self.archive.filming.is_set():
+        if self.session.values["paused"] or self.archive.filming.is_set():
             self.pace.rest()
             return
         self._step()
@@ -146,10 +148,13 @@ class App:
             if now >= due["status"]:
                 due["status"] = now + 1.0 / STATUS_HZ
                 self._show_status()
-            if self.archive.filming.is_set():
+            if not self.archive.drawing.acquire(blocking=False):
                 continue
-            self.scene.shown = self._shown()
-            self.scene.show(latest[1])
+            try:
+                self.scene.shown = self._shown()
+                self.scene.show(latest[1])
+            finally:
+                self.archive.drawing.release()
             if now >= due["plots"] and latest is not drawn and self._live_plots.value:
                 due["plots"] = now + 1.0 / PLOT_HZ
                 self.plots.draw(self._shown())
@@ -208,11 +213,17 @@ class App:
         if event.instance_index is None:
             return
         robot, hand = divmod(event.instance_index, len(self.session.sides))
+        name = f"{ROBOTS[robot]}.{self.session.sides[hand]}.drag"
+        if event.phase == "start":
+            self._told.discard(name)
         point = None if event.phase == "end" else self.scene.to_robot(event.end_position, robot)
         try:
-            self.mailbox.set(f"{ROBOTS[robot]}.{self.session.sides[hand]}.drag", point)
-        except ValueError as error:
-            self.notices.tell(str(error), event.client, "refused")
+            _, notice = self.mailbox.set(name, point)
+        except Refused as refusal:
+            notice = str(refusal)
+        if notice and name not in self._told:  # a drag is many events: its first notice stands for all
+            self._told.add(name)
+            self.notices.tell(notice, event.client, "not as sent")
 
     def _begin_recording(self) -> None:
         if self._recorder is None:

@@ -28,7 +28,9 @@ class Archive:
         self.newest: Recording | None = None
         self.path: Path | None = None
         self.filming = threading.Event()
-        """Set while a film is made: nobody else draws then."""
+        """Set while a film is made: the simulation waits then."""
+        self.drawing = threading.Lock()
+        """Held by whoever draws: a page's loop for one picture, a film until it is done."""
         self._one_film = threading.Lock()
 
     def keep(self, recording: Recording) -> Path:
@@ -52,7 +54,8 @@ class Archive:
         path = self.path.with_suffix(".mp4")
         try:
             self.filming.set()
-            film(client, scene, self.newest, path)
+            with self.drawing:
+                film(client, scene, self.newest, path)
         except OSError as error:
             self._notices.tell(str(error), client, "no film")
         else:

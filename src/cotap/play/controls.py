@@ -10,6 +10,8 @@ from cotap.compliance.laws import DAMPINGS, ERRORS, LawConfig
 from cotap.play import ROBOTS
 
 AXES = ("x", "y", "z")
+PUSH_N, PUSH_S = 600.0, 5.0
+"""Largest force of a push [N] and longest [s]."""
 
 Value = float | bool | str | tuple[float, ...] | None
 
@@ -77,14 +79,16 @@ class Point:
     """Largest magnitude of a coordinate [m]."""
     default: None = None
 
-    def clean(self, value: object) -> tuple[tuple[float, ...] | None, None]:
-        """`value`, three coordinates [m]. Raises Refused for anything else but None."""
+    def clean(self, value: object) -> tuple[tuple[float, ...] | None, str | None]:
+        """`value`, three coordinates [m], within reach, and a notice if one had to be moved there. Raises Refused for
+        anything else but None."""
         if value is None:
             return None, None
         if not isinstance(value, (tuple, list)) or len(value) != 3:
             raise Refused(f"{self.label} must be three coordinates, got {_shown(value)}")
         number = Number(self.label, -self.reach, self.reach, 0.0, 0.0)
-        return tuple(number.clean(v)[0] for v in value), None
+        inside, notices = zip(*(number.clean(v) for v in value), strict=True)
+        return inside, next(filter(None, notices), None)
 
 
 Control = Number | Choice | Flag | Point
@@ -111,6 +115,10 @@ class Ranges:
     checkpoints: tuple[str, ...]
 
 
+SPEED = Number("speed", 0.1, 4.0, 1.0, 0.1)
+"""How many times as fast as the clock."""
+
+
 def make_controls(r: Ranges) -> dict[str, Control]:
     """Every control by name: `velocity_x`, `held.left.z`, `a.left.stiffness_x`, ..."""
     controls: dict[str, Control] = {
@@ -121,9 +129,12 @@ def make_controls(r: Ranges) -> dict[str, Control]:
         "stand": Flag("stand", True),
         "motion": Choice("arm motion", r.motions, r.motions[0]),
         "arm_actions": Flag("policy moves arms", True),
-        "speed": Number("speed", 0.1, 4.0, 1.0, 0.1),
+        "speed": SPEED,
         "paused": Flag("paused", False),
         "side_by_side": Flag("side by side", False),
+        "push.hand": Choice("hand", r.sides, r.sides[0]),
+        "push.force": Number("force [N]", 0.0, PUSH_N, 60.0, 5.0),
+        "push.seconds": Number("for [s]", 0.02, PUSH_S, 0.5, 0.02),
     }
     for side in r.sides:
         for axis in AXES:

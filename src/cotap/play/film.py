@@ -24,13 +24,17 @@ class FilmError(OSError):
 
 
 def film(client: viser.ClientHandle, scene: Scene, recording: Recording, path: Path) -> None:
-    """Write a recording, as `client` sees it from where its camera is, to `path` (MP4).
+    """Write a recording, as `client` sees it from where its camera is, to `path` (MP4). Nobody else may draw meanwhile.
 
     Raises:
         FilmError: the browser went away or stopped drawing; nothing is written.
         OSError: the file cannot be written.
     """
-    write_video(path, _pictures(client, scene, recording), FPS)
+    shown, scene.shown = scene.shown, recording.trajectory.fell.shape[1]
+    try:
+        write_video(path, _pictures(client, scene, recording), FPS)
+    finally:
+        scene.shown = shown
 
 
 def _pictures(client: viser.ClientHandle, scene: Scene, recording: Recording) -> Iterator[np.ndarray]:

@@ -7,10 +7,8 @@ from dataclasses import dataclass
 
 import torch
 
-from cotap.play.controls import Refused
+from cotap.play.controls import PUSH_N, PUSH_S, Refused
 
-PUSH_N, PUSH_S = 600.0, 5.0
-"""Largest force of a push [N] and longest [s]."""
 DRAG_N_M, DRAG_N = 150.0, 60.0
 """Stiffness of the spring that drags a hand [N/m] and its largest force [N]."""
 PUSHES = 8

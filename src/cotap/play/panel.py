@@ -9,7 +9,7 @@ import viser
 
 from cotap.play import ROBOTS
 from cotap.play.controls import AXES, Choice, Control, Flag, Number, Refused
-from cotap.play.forces import PUSH_N, PUSH_S, Push
+from cotap.play.forces import Push
 from cotap.play.mailbox import Mailbox, Request, Reset, Step
 from cotap.play.notices import Notices
 
@@ -104,12 +104,7 @@ class Panel:
 
     def _button(self, label: str, request: Callable[[], Request]) -> None:
         async def click(event: viser.GuiEvent[Any]) -> None:
-            try:
-                asked = request()
-            except Refused as refusal:
-                self._notices.tell(str(refusal), event.client, "refused")
-            else:
-                self._ask(asked, event.client)
+            self._ask(request(), event.client)
 
         self._gui.add_button(label).on_click(click)
 
@@ -137,19 +132,19 @@ class Panel:
                 self._second.append(folder)
 
     def _add_push(self) -> None:
-        hand = self._gui.add_dropdown("hand", self._sides)
-        force = self._gui.add_slider("force [N]", min=0.0, max=PUSH_N, step=5.0, initial_value=60.0)
-        seconds = self._gui.add_slider("for [s]", min=0.02, max=PUSH_S, step=0.02, initial_value=0.5)
+        for part in ("hand", "force", "seconds"):
+            self.bind(f"push.{part}")
         for label, direction in DIRECTIONS.items():
-            self._button(
-                f"Push {label}",
-                lambda d=direction: make_push(self._sides, hand.value, force.value, seconds.value, d),
-            )
+            self._button(f"Push {label}", lambda d=direction: self._push(d))
         with self._gui.add_folder("Held load, axes of the robot's heading"):
             for side in self._sides:
                 for axis in AXES:
                     self.bind(f"held.{side}.{axis}")
         self._gui.add_markdown("Drag an orange ball with the mouse: a spring pulls that hand after it.")
+
+    def _push(self, direction: tuple[float, float, float]) -> Push:
+        x, y, z = (self._good["push.force"] * d for d in direction)
+        return Push(self._good["push.hand"], (x, y, z), self._good["push.seconds"])
 
     def _add_domain(self) -> None:
         for robot in ROBOTS:
@@ -162,14 +157,3 @@ class Panel:
     def _show_second(self, on: bool) -> None:
         for folder in self._second:
             folder.visible = on
-
-
-def make_push(
-    sides: tuple[str, ...], side: object, force: object, seconds: object, direction: tuple[float, float, float]
-) -> Push:
-    """A push from what the page's fields hold, within its limits. Raises Refused for no number and no hand."""
-    hand, _ = Choice("hand", sides, sides[0]).clean(side)
-    size, _ = Number("force [N]", 0.0, PUSH_N, 0.0, 0.0).clean(force)
-    duration, _ = Number("duration [s]", 0.02, PUSH_S, 0.0, 0.0).clean(seconds)
-    x, y, z = (size * d for d in direction)
-    return Push(hand, (x, y, z), duration)

@@ -11,6 +11,7 @@ import viser
 
 from cotap.evaluation.recording import Recording, RecordingError
 from cotap.play.archive import Archive
+from cotap.play.controls import SPEED, Number, Refused
 from cotap.play.notices import Notices
 from cotap.play.plots import SECONDS, Plots
 from cotap.play.recorder import samples_of
@@ -45,23 +46,22 @@ class Replay:
         self._stop = threading.Event()
         self.scene = Scene(server, spec, self._count)
         self.scene.shown = self._count
-        archive = Archive(path.parent, Notices(server))
-        archive.newest, archive.path = recording, path
-        self._filming = archive.filming
+        self._notices = Notices(server)
+        self._archive = Archive(path.parent, self._notices)
+        self._archive.newest, self._archive.path = recording, path
         gui = server.gui
         gui.add_markdown(f"**{path.name}**, {len(self._samples) * self._dt:.1f} s")
         self._playing = gui.add_checkbox("play", True)
-        self._speed = gui.add_slider("speed", min=0.1, max=4.0, step=0.1, initial_value=1.0)
-        self._time = gui.add_slider(
-            "time [s]",
-            min=0.0,
-            max=max(self._dt, self._dt * (len(self._samples) - 1)),
-            step=self._dt,
-            initial_value=0.0,
+        self._speed, self._at = SPEED.default, 0.0
+        end = max(self._dt, round(self._dt * (len(self._samples) - 1), 6))
+        self._range = Number("time [s]", 0.0, end, 0.0, self._dt)
+        speed, self._time = (
+            gui.add_slider(n.label, min=n.low, max=n.high, step=n.step, initial_value=n.default)
+            for n in (SPEED, self._range)
         )
-        self._at = 0.0
+        speed.on_update(self._set_speed)
         self._time.on_update(self._seek)
-        archive.add_buttons(gui, self.scene)
+        self._archive.add_buttons(gui, self.scene)
         with gui.add_folder("Plots") as folder:
             gui.add_markdown(f"The last {SECONDS:g} s before what is shown.")
         self._plots = Plots(server, folder, tuple(arm.side for arm in spec.arms), self._dt)
@@ -72,17 +72,26 @@ class Replay:
         while not self._stop.wait(1.0 / DRAW_HZ):
             now = time.monotonic()
             passed, last = now - last, now
-            if self._filming.is_set():
+            if not self._archive.drawing.acquire(blocking=False):
                 continue
-            if self._playing.value:
-                self._at = (self._at + passed * float(self._speed.value)) % (len(self._samples) * self._dt)
-            step = min(int(self._at / self._dt), len(self._samples) - 1)
-            self.scene.show(self._samples[step])
-            if self._playing.value:
-                self._time.value = round(step * self._dt, 6)
+            try:
+                step = self.advance(passed)
+            finally:
+                self._archive.drawing.release()
             if now - plotted > 0.5:
                 plotted = now
                 self._plot(step)
+
+    def advance(self, passed: float) -> int:
+        """Go on by `passed` seconds of the clock's, if it plays, and draw. Returns the number of the step drawn."""
+        playing = self._playing.value
+        if playing:
+            self._at = (self._at + passed * self._speed) % (len(self._samples) * self._dt)
+        step = min(int(self._at / self._dt + 1e-6), len(self._samples) - 1)  # 0.58 / 0.02 is a little below 29
+        self.scene.show(self._samples[step])
+        if playing:
+            self._time.value = round(step * self._dt, 6)
+        return step
 
     def stop(self) -> None:
         """Let `run` return."""
@@ -96,4 +105,19 @@ class Replay:
 
     async def _seek(self, event: viser.GuiEvent[Any]) -> None:
         if event.client_id is not None:  # a person's hand, not the clock
-            self._at = min(max(float(event.target.value), 0.0), self._dt * (len(self._samples) - 1))
+            self._at = self._accepted(self._range, event, self._at)
+
+    async def _set_speed(self, event: viser.GuiEvent[Any]) -> None:
+        if event.client_id is not None:
+            self._speed = self._accepted(SPEED, event, self._speed)
+
+    def _accepted(self, number: Number, event: viser.GuiEvent[Any], before: float) -> float:
+        """What was sent, as it can be used; where that differs, people are told, and the page shows it."""
+        try:
+            value, notice = number.clean(event.target.value)
+        except Refused as refusal:
+            value, notice = before, str(refusal)
+        if notice:
+            self._notices.tell(notice, event.client, "not as sent")
+            event.target.value = value
+        return value

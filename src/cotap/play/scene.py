@@ -41,11 +41,13 @@ class Scene:
     Args:
         server: Where to draw.
         spec: The robot.
-        count: How many robots samples hold.
+        count: How many robots samples hold at most.
     """
 
     def __init__(self, server: viser.ViserServer, spec: RobotSpec, count: int) -> None:
-        self.shown, self.follow = 1, True
+        self.shown = 1
+        """How many robots, from the first on, are drawn; those that a sample lacks are not."""
+        self.follow = True
         self.ellipsoids, self.contacts = True, True
         self.robot = spec.name
         self._server, self._count, self._hands = server, count, len(spec.arms)
@@ -71,21 +73,25 @@ class Scene:
 
     def show(self, sample: Sample) -> None:
         """Draw one step."""
+        rows = len(sample["qpos"])
+        shown = min(self.shown, rows)
+        # Batches keep their sizes: the last robot stands in for those that are lacking, hidden.
+        sample = {name: value[np.minimum(np.arange(self._count), rows - 1)] for name, value in sample.items()}
         poses = [self._pose.of(qpos) for qpos in sample["qpos"]]
         apart = np.array([[0.0, -APART_M * i, 0.0] for i in range(self._count)])
         # Following moves the world, not people's cameras: those stay theirs to turn.
-        centre = sample["qpos"][: self.shown, :2].mean(0) if self.follow else np.zeros(2)
-        middle = apart[: self.shown].mean(0) if self.follow else np.zeros(3)
+        centre = sample["qpos"][:shown, :2].mean(0) if self.follow else np.zeros(2)
+        middle = apart[:shown].mean(0) if self.follow else np.zeros(3)
         self._offset = apart - middle - np.array([*centre, 0.0])
         with self._server.atomic():
             self._floor.position = self._offset[0]
-            self._robots.show_only_selected = self.shown < self._count
+            self._robots.show_only_selected = shown < self._count
             self._robots.update_from_arrays(
                 np.stack([p[0] for p in poses]) + self._offset[:, None], np.stack([p[1] for p in poses]), env_idx=0
             )
-            self._show_hands(sample)
-            self._show_forces(sample)
-            self._show_contacts([p[2] for p in poses])
+            self._show_hands(sample, shown)
+            self._show_forces(sample, shown)
+            self._show_contacts([p[2] for p in poses[:shown]])
         self._server.flush()
 
     def cast_shadows(self, on: bool) -> None:
@@ -120,13 +126,10 @@ class Scene:
             wireframe=wireframe, cast_shadow=False, receive_shadow=False, lod="off",
         )  # fmt: skip
 
-    def _visible(self) -> np.ndarray:
-        """(W, H, 1) 1 for what belongs to a robot that is shown, else nearly 0."""
-        shown = np.where(np.arange(self._count) < self.shown, 1.0, HIDDEN)
-        return np.broadcast_to(shown[:, None, None], (self._count, self._hands, 1))
-
-    def _show_hands(self, s: Sample) -> None:
-        place, visible = self._offset[:, None], self._visible()
+    def _show_hands(self, s: Sample, shown: int) -> None:
+        place = self._offset[:, None]
+        there = np.where(np.arange(self._count) < shown, 1.0, HIDDEN)
+        visible = np.broadcast_to(there[:, None, None], (self._count, self._hands, 1))
         hands = _batched(s["hand_w"] + place)
         self.hands.batched_positions = hands
         self._references.batched_positions = _batched(s["hand_reference_w"] + place)
@@ -145,20 +148,20 @@ class Scene:
             handle.batched_wxyzs = turn.wxyz.astype(np.float32)
             handle.batched_scales = _batched(np.maximum(size, HIDDEN))
 
-    def _show_forces(self, s: Sample) -> None:
-        force = s["hand_force_w"][: self.shown].reshape(-1, 3)
+    def _show_forces(self, s: Sample, shown: int) -> None:
+        force = s["hand_force_w"][:shown].reshape(-1, 3)
         size = np.linalg.norm(force, axis=1)
         on = size > 0.1
         self._arrows.visible = bool(on.any())
         if on.any():
-            tip = (s["hand_w"] + self._offset[:, None])[: self.shown].reshape(-1, 3)[on]
+            tip = (s["hand_w"] + self._offset[:, None])[:shown].reshape(-1, 3)[on]
             length = np.minimum(ARROW_M * size[on] + 0.06, ARROW_MAX_M)
             # The arrow ends where it pushes.
             start = tip - force[on] / size[on, None] * length[:, None]
             self._arrows.points = np.stack((start, tip), 1).astype(np.float32)
 
     def _show_contacts(self, contacts: list[np.ndarray]) -> None:
-        points = [c + self._offset[i] for i, c in enumerate(contacts[: self.shown])]
+        points = [c + self._offset[i] for i, c in enumerate(contacts)]
         points = np.concatenate(points) if points else np.zeros((0, 3))
         self._contact_points.visible = bool(len(points)) and self.contacts
         if len(points):

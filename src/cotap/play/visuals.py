@@ -14,12 +14,11 @@ from cotap.robots.mjcf import build_mjspec, build_model
 
 
 class RobotPose:
-    """From configurations to body poses and contacts, one robot at a time."""
+    """From configurations to body poses and contacts of all shapes, one robot at a time."""
 
     def __init__(self, spec: RobotSpec, visual: mujoco.MjModel) -> None:
-        self._model = build_model(spec)
+        self._model = build_model(spec, "full")
         self._data = mujoco.MjData(self._model)
-        self._floor = self._model.geom("floor").id
         bodies = [visual.body(i).name for i in range(visual.nbody)]
         own = {self._model.body(i).name: i for i in range(self._model.nbody)}
         # A body that only the visual model has stays with the world; it has no shape that matters.

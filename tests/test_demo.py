@@ -1,0 +1,34 @@
+"""The demo, with nothing trained or measured: what it asks for, and what it tells to do next."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
+import demo
+
+
+@pytest.mark.usefixtures("in_tmp_path")
+@pytest.mark.parametrize("filmed", [True, False])
+def test_it_ends_with_the_command_that_the_readme_has_for_the_page(monkeypatch, capsys, filmed):
+    def evaluate(arguments):
+        if "--json" in arguments:
+            value = {"mean": 0.5, "ci95": [0.4, 0.6]}
+            Path(arguments[arguments.index("--json") + 1]).write_text(
+                json.dumps({"metrics": dict.fromkeys(demo.MEASURES, value)})
+            )
+        return 0 if filmed or "--video" not in arguments else 2
+
+    monkeypatch.setenv("MUJOCO_GL", "osmesa")  # else the demo would set it for all tests that follow
+    monkeypatch.setattr("cotap.evaluate.main", evaluate)
+    monkeypatch.setattr("cotap.train.main", lambda _: 0)
+    assert demo.main() == 0
+    out = capsys.readouterr().out
+    assert "| worlds that fell | 0.500 (0.400 to 0.600) | 0.500 (0.400 to 0.600) |" in out
+    command = ".venv/bin/python -m cotap.play"
+    assert command in out.splitlines()[-1]
+    assert f"`{command}`" in (Path(__file__).parents[1] / "README.md").read_text()
