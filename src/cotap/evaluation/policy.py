@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -12,6 +13,8 @@ import torch
 from cotap.agents.actors import AgentLayout, DualActorCritic
 from cotap.agents.checkpoint import MALFORMED, CheckpointError, load_checkpoint, require_parts
 from cotap.checks import require_one_of, require_positive_int
+from cotap.configs import from_plain
+from cotap.envs import H1EnvConfig
 
 CHECKPOINTS = ("base", "cotap", "facet", "cotap-no-ratio", "cotap-torque-critic", "cotap-goals")
 """Names under which checkpoints are shipped: both stages, the second under FACET's law, and its ablations."""
@@ -52,8 +55,13 @@ class Policy:
 
     model: DualActorCritic
     layout: dict[str, Any]
-    config: dict[str, Any]
     stage: str
+    _env_config: H1EnvConfig
+
+    @property
+    def env_config(self) -> H1EnvConfig:
+        """The environment that it was trained in, simulated by whatever there is here; a copy, free to be changed."""
+        return copy.deepcopy(self._env_config)
 
     def to(self, device: torch.device | str) -> Policy:
         """The same policy, its networks moved to `device`."""
@@ -67,13 +75,14 @@ class Policy:
 
 
 def load_policy(path: Path | str) -> Policy:
-    """Load a checkpoint's networks for use.
+    """Load a checkpoint's networks for use, and the environment's config.
 
     Raises:
         CheckpointError: the file cannot be used.
     """
     content = load_checkpoint(path)
     require_parts(path, content, ("layout", "model", "agents", "config", "kind"))
+    env_config = _env_config_of(path, content)
     layout, weights, agents = content["layout"], content["model"], content["agents"]
     try:
         widths = content["config"]["training"]["ppo"]["hidden"]
@@ -83,4 +92,16 @@ def load_policy(path: Path | str) -> Policy:
     except MALFORMED as error:
         raise CheckpointError(f"checkpoint {str(path)!r} has networks that do not fit its config: {error}") from error
     model.eval()
-    return Policy(model, layout, content["config"], content["kind"])
+    return Policy(model, layout, content["kind"], env_config)
+
+
+def _env_config_of(path: Path | str, content: dict[str, Any]) -> H1EnvConfig:
+    try:
+        cfg = from_plain(H1EnvConfig, content["config"]["training"]["env"])
+        cfg.backend = "auto"  # the one it was trained on may not be installed here
+        cfg.check()
+    except KeyError as error:
+        raise CheckpointError(f"checkpoint {str(path)!r} has no {error} in its config") from error
+    except MALFORMED as error:
+        raise CheckpointError(f"checkpoint {str(path)!r} has no usable environment config: {error}") from error
+    return cfg
