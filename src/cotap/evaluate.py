@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from cotap.checks import require_one_of
+from cotap.checks import require_one_of, require_range, require_seed
 from cotap.configs import to_plain
 from cotap.evaluation.disturbance import ConstantLoad, Impact
 from cotap.evaluation.fall_curve import FallCurve
@@ -189,6 +189,8 @@ def _prepare(options: CommonOptions, protocol: Any) -> tuple[H1Env, Policy, str]
     from cotap.sim import resolve_backend
 
     protocol.check()
+    require_seed("seed", protocol.seed)
+    require_range("threads", options.threads, 0, 4096)
     upper_body = options.laws.configure()
     for name in ("json", "plot", "video"):
         _require_folder(name, getattr(options, name, ""))

@@ -146,7 +146,7 @@ def load_scenario(path: Path | str, spec: RobotSpec) -> Scenario:
         data = tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise ValueError(f"scenario {str(path)!r} does not exist") from error
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # not text, not TOML, or nested without end
         raise ValueError(f"scenario {str(path)!r} is not TOML: {error}") from error
     try:
         scenario = from_plain(Scenario, data)
