@@ -40,13 +40,15 @@ class OnnxPolicy:
         options.log_severity_level = 4  # what goes wrong is raised; it need not be printed as well
         try:
             self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+            properties = self._session.get_modelmeta().custom_metadata_map
+            inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
         except Exception as error:  # onnxruntime's errors share no base but this
             raise PolicyError(f"{where} cannot be read as ONNX: {str(error).splitlines()[0]}") from error
-        self.metadata = read_metadata(where, self._session.get_modelmeta().custom_metadata_map)
+        self.metadata = read_metadata(where, properties)
         joints, width = len(self.metadata.joints), self.metadata.observation_width
-        self._require(where, "inputs", self._session.get_inputs(), {INPUT: [1, width]})
+        self._require(where, "inputs", inputs, {INPUT: [1, width]})
         wanted = {TARGETS: [1, joints], ACTION: [1, joints]}
-        self._require(where, "outputs", self._session.get_outputs(), wanted)
+        self._require(where, "outputs", outputs, wanted)
         self._input = np.zeros((1, width), dtype=np.float32)
         self._require_scale(where)
 
