@@ -204,6 +204,27 @@ def test_a_checkpoint_without_its_environment_is_refused_by_name(trained: Traine
 
 
 @pytest.mark.parametrize("use", [evaluates, plays, exports])
+@pytest.mark.parametrize(
+    ("part", "value", "message"),
+    [
+        ("action_slices", {"lower": [1, 12], "upper": [12, 20]}, "are not those of 19 joints in order"),
+        ("action_slices", {"upper": [11, 19], "lower": [0, 11]}, "are not those of 19 joints in order"),
+        ("obs_groups", {"actor": ["privileged"], "critic": ["policy"]}, "do not read the layout's observation of 430"),
+        ("observation_widths", {"policy": 86, "privileged": 13}, "do not read the layout's observation of 430"),
+    ],
+)
+def test_networks_for_another_robot_are_refused_by_name(
+    trained: Trained, use: Any, part: str, value: Any, message: str
+):
+    """However well they fit their own weights, which are not looked at before."""
+    content = copy.deepcopy(trained.content)
+    content["agents"][part] = value
+    save_checkpoint(trained.folder / "other.pt", content)
+    with pytest.raises(CheckpointError, match=rf"(?s)other\.pt'.*{message}"):
+        use(trained.folder / "other.pt")
+
+
+@pytest.mark.parametrize("use", [evaluates, plays, exports])
 @few
 @given(draw=st.data())
 def test_a_changed_policy_is_used_or_refused(trained: Trained, use: Any, draw: st.DataObject):

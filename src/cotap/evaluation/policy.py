@@ -87,12 +87,26 @@ def load_policy(path: Path | str) -> Policy:
     try:
         widths = content["config"]["training"]["ppo"]["hidden"]
         hidden = tuple(require_positive_int(f"ppo.hidden[{i}]", width) for i, width in enumerate(widths))
-        model = DualActorCritic(AgentLayout.from_plain(agents), hidden, 1.0)
+        networks = AgentLayout.from_plain(agents)
+        _require_fitting(networks, layout)
+        model = DualActorCritic(networks, hidden, 1.0)
         model.load_state_dict(weights)
     except MALFORMED as error:
         raise CheckpointError(f"checkpoint {str(path)!r} has networks that do not fit its config: {error}") from error
     model.eval()
     return Policy(model, layout, content["kind"], env_config)
+
+
+def _require_fitting(networks: AgentLayout, layout: dict[str, Any]) -> None:
+    """Raise ValueError unless actors read the observation that `layout` tells of, and move its joints in order."""
+    width = layout["history"] * sum(width for _, width, _ in layout["terms"])
+    if networks.obs_groups["actor"] != ["policy"] or networks.width("actor") != width:
+        raise ValueError(f"actors do not read the layout's observation of {width} numbers alone")
+    parts = networks.action_slices.values()
+    if [*(s.start for s in parts), len(layout["joints"])] != [0, *(s.stop for s in parts)]:
+        raise ValueError(
+            f"actions of {networks.action_slices} are not those of {len(layout['joints'])} joints in order"
+        )
 
 
 def _env_config_of(path: Path | str, content: dict[str, Any]) -> H1EnvConfig:
