@@ -15,8 +15,7 @@ import numpy as np
 import torch
 
 from cotap.agents.actors import as_dict
-from cotap.configs import from_plain
-from cotap.envs import H1Env, H1EnvConfig, step_timing
+from cotap.envs import H1Env, step_timing
 from cotap.envs.commands import STEADY_RAD, Catch, Command
 from cotap.envs.state import RobotState
 from cotap.envs.step_timing import BINS, FallRisk, feature_reflection, features, risk_at
@@ -85,7 +84,7 @@ def collect(options: argparse.Namespace) -> int:
     """Run trials and write them."""
     torch.set_num_threads(options.threads)
     policy = load_policy(options.checkpoint)
-    cfg = from_plain(H1EnvConfig, policy.config["training"]["env"])
+    cfg = policy.env_config
     cfg.num_envs, cfg.seed, cfg.num_threads = options.num_envs, options.seed, options.threads
     cfg.assist.enabled = cfg.commands.step_timing = False
     cfg.commands.steady_rad, cfg.commands.stand_probability = STEADY_RAD, 0.4

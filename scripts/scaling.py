@@ -62,18 +62,23 @@ def measure(layouts: list[tuple[int, int]], worlds: int, iterations: int, seeds:
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """As Markdown: throughput against the first row, and the end of the curves, mean and spread over seeds."""
+    """As Markdown: throughput against the first row, and the end of the curves, mean and deviation over seeds."""
     lines = [
         "| processes x threads | env steps/s | of the first | " + " | ".join(LEARNING) + " |",
         "|---|---|---|" + "---|" * len(LEARNING),
     ]
     for r in rows:
         share = r["steps_per_s"] / rows[0]["steps_per_s"]
-        ends = [f"{statistics.fmean(v):.4f} +- {statistics.pstdev(v):.4f}" for v in r["ends"].values()]
+        ends = [_mean_and_spread(v) for v in r["ends"].values()]
         lines.append(
             f"| {r['processes']} x {r['threads']} | {r['steps_per_s']:,.0f} | {share:.3f} | {' | '.join(ends)} |"
         )
     return "\n".join(lines)
+
+
+def _mean_and_spread(values: list[float]) -> str:
+    spread = f" +- {statistics.stdev(values):.4f}" if len(values) > 1 else " (one seed)"
+    return f"{statistics.fmean(values):.4f}{spread}"
 
 
 def count() -> dict[str, Any]:
@@ -107,7 +112,8 @@ def _count_in(rank: int, size: int, port: int, work: str) -> None:
         runner = DualRunner(
             H1Env(training.env, size), training.runner, training.ppo, Path(work), to_plain(training), ranks=ranks
         )
-        act = runner.alg.act
+        act, iterate = runner.alg.act, runner._iterate
+        begins: list[tuple[Counter[str], Counter[str]]] = []
 
         def watched(observations: Any) -> torch.Tensor:
             nonlocal ranks_in_act
@@ -116,9 +122,13 @@ def _count_in(rank: int, size: int, port: int, work: str) -> None:
             ranks_in_act = False
             return actions
 
-        runner.alg.act = watched
+        def begun(observations: Any) -> Any:
+            begins.append((messages.copy(), total.copy()))
+            return iterate(observations)
+
+        runner.alg.act, runner._iterate = watched, begun
         dist.all_reduce = counted
-        runner._iterate(runner._observations())
+        runner.learn(2)  # from the beginning of the first to that of the second is one iteration, whole
         dist.all_reduce = all_reduce
     if rank == 0:
         weights = {
@@ -126,7 +136,8 @@ def _count_in(rank: int, size: int, port: int, work: str) -> None:
             for m in [runner.alg.model]
             for n in runner.alg.names
         }
-        result = {"messages": dict(messages), "bytes": dict(total), "weights": weights}
+        sent = [dict(after - before) for before, after in zip(*begins, strict=True)]
+        result = {"messages": sent[0], "bytes": sent[1], "weights": weights}
         (Path(work) / "counts.json").write_text(json.dumps(result))
 
 

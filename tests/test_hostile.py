@@ -6,22 +6,27 @@ import copy
 import json
 import math
 import os
+import re
+import sys
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import pytest
 import torch
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from cotap import compare, evaluate, train
+from cotap import compare, deploy, evaluate, export, train
 from cotap.agents.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
 from cotap.agents.runner import DualRunner
 from cotap.compliance.laws import LawConfig
 from cotap.configs import BASE_RECIPES, BaseTraining, from_plain, to_plain
+from cotap.deployment import graph, trials
+from cotap.deployment.scenario import load_scenario
 from cotap.envs import H1Env
 from cotap.evaluation.law_options import parse_law
 from cotap.evaluation.policy import load_policy
@@ -36,10 +41,20 @@ from cotap.evaluation.recording import (
     measure,
 )
 from cotap.evaluation.rollout import Trajectory
+from cotap.motions import __main__ as motions
+from cotap.motions import show
 from cotap.motions.formats import FORMATS
 from cotap.motions.joblib_files import load_joblib
 from cotap.motions.library import MotionError, MotionLibrary, shipped_library
-from cotap.robots import RobotSpec
+from cotap.play import __main__ as play
+from cotap.play import server
+from cotap.play.session import Session
+from cotap.robots import RobotSpec, h1
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
 
 EXAMPLES = int(os.environ.get("COTAP_FUZZ_EXAMPLES", "0"))
 """How many inputs each property is tried on; 0 for a few that are always the same."""
@@ -148,6 +163,82 @@ def test_a_checkpoint_with_changed_parts_is_whole_or_refused(trained: Trained, d
             assert "parts.pt" in str(error)  # noqa: PT017  whether it is raised depends on what was drawn
 
 
+def evaluates(path: Path) -> None:
+    """Raises ValueError as `cotap.evaluate` would report it."""
+    args = ["velocity-tracking", "--checkpoint", str(path), "--num-envs", "2", "--threads", "1"]
+    brief = ["--episode-seconds", "0.2", "--command-seconds", "0.2", "--settle-seconds", "0.04"]
+    evaluate.evaluate([*args, *brief])
+
+
+def plays(path: Path) -> None:
+    """What the page does with a checkpoint, first of all and when it is chosen."""
+    session = Session({"this": path})
+    session.step()
+    session.trained_otherwise("this")
+
+
+def exports(path: Path) -> None:
+    graph.export_policy(path, path.with_suffix(".onnx"), checks=2)
+
+
+@pytest.mark.parametrize("use", [evaluates, plays, exports])
+@pytest.mark.parametrize(
+    ("env", "message"),
+    [
+        (None, "has no 'env' in its config"),
+        (3, "has no usable environment config: H1EnvConfig must be a table of fields, got int 3"),
+        ({"control_dt": "x"}, "has no usable environment config: control_dt must be of type float, got str 'x'"),
+        ({"control_dt": -1.0}, "has no usable environment config: control_dt must lie in"),
+        ({"robot": "g7"}, "has no usable environment config: robot 'g7' is unknown"),
+    ],
+)
+def test_a_checkpoint_without_its_environment_is_refused_by_name(trained: Trained, use: Any, env: Any, message: str):
+    content = copy.deepcopy(trained.content)
+    if env is None:
+        del content["config"]["training"]["env"]
+    else:
+        content["config"]["training"]["env"] = env
+    save_checkpoint(trained.folder / "env.pt", content)
+    with pytest.raises(CheckpointError, match=rf"env\.pt' {message}"):
+        use(trained.folder / "env.pt")
+
+
+@pytest.mark.parametrize("use", [evaluates, plays, exports])
+@pytest.mark.parametrize(
+    ("part", "value", "message"),
+    [
+        ("action_slices", {"lower": [1, 12], "upper": [12, 20]}, "are not those of 19 joints in order"),
+        ("action_slices", {"upper": [11, 19], "lower": [0, 11]}, "are not those of 19 joints in order"),
+        ("obs_groups", {"actor": ["privileged"], "critic": ["policy"]}, "do not read the layout's observation of 430"),
+        ("observation_widths", {"policy": 86, "privileged": 13}, "do not read the layout's observation of 430"),
+    ],
+)
+def test_networks_for_another_robot_are_refused_by_name(
+    trained: Trained, use: Any, part: str, value: Any, message: str
+):
+    """However well they fit their own weights, which are not looked at before."""
+    content = copy.deepcopy(trained.content)
+    content["agents"][part] = value
+    save_checkpoint(trained.folder / "other.pt", content)
+    with pytest.raises(CheckpointError, match=rf"(?s)other\.pt'.*{message}"):
+        use(trained.folder / "other.pt")
+
+
+@pytest.mark.parametrize("use", [evaluates, plays, exports])
+@few
+@given(draw=st.data())
+def test_a_changed_policy_is_used_or_refused(trained: Trained, use: Any, draw: st.DataObject):
+    """By all who load one, with changes in the parts that they read."""
+    parts = ("kind", "layout", "agents", "config", "model")
+    read = {part: trained.content[part] for part in parts}
+    path = trained.folder / "policy.pt"
+    save_checkpoint(path, trained.content | damage(read, draw, plain | tensors))
+    try:
+        use(path)
+    except ValueError as error:
+        assert "policy.pt" in str(error)  # noqa: PT017
+
+
 STATES = [
     ("env", "parts", "upper_body", "parameters", "alpha"),
     ("env", "parts", "commands", "_stand"),
@@ -242,6 +333,162 @@ def test_a_command_line_is_obeyed_or_refused(
         said = capsys.readouterr()
         assert status in (0, 2), said.err
         assert status == 0 or said.err or said.out
+
+
+class Begun(Exception):
+    """A command line was accepted, and work would begin."""
+
+
+OPTIONS = {
+    "motions": ["import", "show", "good.npz", "nowhere", "--output", "--format", "auto", "amass", "--mirror", "--clip",
+                "--robot", "h1"],
+    "export": ["--output", "p.onnx", "nowhere/p.onnx", "--checkpoint", "base", "--checks", "--seed"],
+    "deploy": ["--policy", "good.onnx", "--scenario", "good.toml", "--trials", "--seconds", "--arm-motion", "random",
+               "--left", "cotap:alpha=0.7", "--seed", "--engine", "mujoco", "--timestep", "--delay-steps", "--json"],
+    "compare": ["good.json", "--without-falls", "--json", "nowhere/o.json"],
+    "play": ["--host", "127.0.0.1", "--port", "--checkpoint", "good.pt", "--robot", "h1", "--replay", "--seed"],
+}  # fmt: skip
+NUMBERS = ["0", "1", "2", "-1", "2.5", "1e400", "nan", "9" * 30, ""]
+BEGINNINGS = {
+    "motions": [["import", "nowhere", "--output", "o.npz"], ["show", "good.npz"]],
+    "export": [["--output", "p.onnx"]],
+    "deploy": [["--policy", "good.onnx"], ["--policy", "good.onnx", "--scenario", "good.toml"]],
+    "compare": [["good.json", "good.json"]],
+    "play": [["--checkpoint", "good.pt"], ["--port", "8080"]],
+}
+
+
+@pytest.fixture(scope="module")
+def good_files(trained: Trained, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a good file of each kind that command lines name."""
+    folder = tmp_path_factory.mktemp("good")
+    graph.export_policy(trained.folder / "run" / "checkpoint_000001.pt", folder / "good.onnx", checks=2)
+    save_checkpoint(folder / "good.pt", trained.content)
+    (folder / "good.toml").write_text(SCENARIO)
+    (folder / "good.json").write_text(json.dumps(RESULT))
+    spec = h1()
+    MotionLibrary(shipped_library(spec).clips[:1], spec).save(folder / "good.npz")
+    return folder
+
+
+@pytest.mark.parametrize("command", sorted(OPTIONS))
+@few
+@given(draw=st.data())
+def test_every_command_is_obeyed_or_refused(
+    command: str, good_files: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    draw: st.DataObject,
+):  # fmt: skip
+    """Up to where work would begin, or a page would be opened."""
+
+    def begin(*_: Any, **__: Any) -> None:
+        raise Begun
+
+    monkeypatch.chdir(good_files)
+    for module, work in (
+        (motions, "import_motions"), (show, "show"), (graph, "export_policy"), (trials, "run_trials"),
+        (compare, "table"), (server.viser, "ViserServer"),
+    ):  # fmt: skip
+        monkeypatch.setattr(module, work, begin)
+    word = st.sampled_from(OPTIONS[command]) | st.sampled_from(NUMBERS) | st.text(max_size=6)
+    args = [*draw.draw(st.sampled_from([*BEGINNINGS[command], []])), *draw.draw(st.lists(word, max_size=4))]
+    main = {"motions": motions, "export": export, "deploy": deploy, "compare": compare, "play": play}[command].main
+    try:
+        status = main(args)
+    except Begun:
+        return
+    except SystemExit as stop:  # the parser's way
+        status = int(stop.code or 0)
+    said = capsys.readouterr()
+    asked = {"-h", "--help"} & set(args)
+    assert status == (0 if asked and not said.err else 2), said.err
+    assert said.err or said.out
+
+
+SCENARIO = """
+seconds = 0.06
+left = "cotap:alpha=0.5"
+[arms]
+clip = ""
+[[command]]
+at = 0.0
+velocity = [0.3, 0.0]
+[[command]]
+at = 0.02
+stand = true
+[[force]]
+force = [10.0, 0.0, 0.0]
+hand = "left"
+"""
+
+
+def deploys(args: list[str], named: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """A file is used on a robot, or refused with an error that names it."""
+    status = deploy.main([*args, "--seconds", "0.06"])
+    told = capsys.readouterr().err
+    assert status in (0, 2)
+    assert status == 0 or re.match(f"error: .*({named})", told, re.DOTALL), told
+
+
+@few
+@given(draw=st.data())
+def test_an_onnx_file_with_changed_bytes_is_used_or_refused(
+    good_files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], draw: st.DataObject
+):
+    path = tmp_path / "changed.onnx"
+    path.write_bytes(changed_bytes((good_files / "good.onnx").read_bytes(), draw))
+    deploys(["--policy", str(path)], "changed.onnx|the policy's metadata|the policy was trained", capsys)
+
+
+@few
+@given(draw=st.data())
+def test_an_onnx_file_with_changed_metadata_is_used_or_refused(
+    good_files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], draw: st.DataObject
+):
+    proto = onnx.load(good_files / "good.onnx")
+    entries = damage({p.key: json.loads(p.value) for p in proto.metadata_props}, draw, json_values)
+    onnx.helper.set_model_props(proto, {name: json.dumps(value) for name, value in entries.items()})
+    path = tmp_path / "changed.onnx"
+    onnx.save(proto, path)
+    deploys(["--policy", str(path)], "changed.onnx|the policy's metadata|the policy was trained", capsys)
+
+
+@few
+@given(draw=st.data())
+def test_a_scenario_with_changed_bytes_is_used_or_refused(
+    good_files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], draw: st.DataObject
+):
+    path = tmp_path / "changed.toml"
+    path.write_bytes(changed_bytes(SCENARIO.encode(), draw))
+    deploys(["--policy", str(good_files / "good.onnx"), "--scenario", str(path)], "changed.toml|clip", capsys)
+
+
+def as_toml(value: Any) -> str:
+    """A value of plain data in TOML; what TOML lacks as text."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{json.dumps(str(k))} = {as_toml(v)}" for k, v in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(as_toml, value)) + "]"
+    return repr(value) if isinstance(value, float) else json.dumps("" if value is None else value)
+
+
+@few
+@given(draw=st.data())
+def test_a_scenario_with_changed_values_is_used_or_refused(spec: RobotSpec, tmp_path: Path, draw: st.DataObject):
+    values = damage(tomllib.loads(SCENARIO), draw, json_values)
+    path = tmp_path / "changed.toml"
+    path.write_text("\n".join(f"{json.dumps(k)} = {as_toml(v)}" for k, v in values.items()), encoding="utf-8")
+    try:
+        scenario = load_scenario(path, spec)
+        scenario.forces(spec, 0.02)
+        scenario.arms.reference(spec, 0.02)
+    except ValueError as error:
+        assert "changed.toml" in str(error) or "clip" in str(error)  # noqa: PT017
+
+
+def test_a_scenario_nested_without_end_is_refused(spec: RobotSpec, tmp_path: Path):
+    (tmp_path / "deep.toml").write_text("seconds = " + "[" * 100_000)
+    with pytest.raises(ValueError, match=r"deep\.toml' is not TOML"):
+        load_scenario(tmp_path / "deep.toml", spec)
 
 
 def motion_files(spec: RobotSpec, folder: Path) -> dict[str, Path]:

@@ -18,6 +18,13 @@ def require_positive_int(name: str, value: int) -> int:
     return value
 
 
+def require_seed(name: str, value: int) -> int:
+    """Return `value` if every random number generator takes it as a seed, else raise ValueError."""
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= 2**62:
+        raise ValueError(f"{name} must be an integer from 0 to 2**62, got {value!r}")
+    return value
+
+
 def is_finite(value: object) -> TypeGuard[float]:
     """Whether `value` is a number that a float holds; an integer may be beyond."""
     try:

@@ -11,7 +11,7 @@ from typing import Any
 
 import tyro
 
-from cotap.checks import require_positive_int
+from cotap.checks import require_positive_int, require_seed
 from cotap.deployment.engines import EngineConfig
 from cotap.deployment.robot import Perturbations
 from cotap.deployment.safety import SafetyConfig
@@ -75,6 +75,7 @@ def deploy(options: DeployOptions) -> dict[str, Any]:
     from cotap.deployment.trials import report, run_trials
 
     require_positive_int("trials", options.trials)
+    require_seed("seed", options.seed)
     for part in (options.engine, options.perturbations, options.safety):
         part.check()
     for name in ("json", "video"):

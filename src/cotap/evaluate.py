@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from cotap.checks import require_one_of
-from cotap.configs import from_plain, to_plain
+from cotap.checks import require_one_of, require_range, require_seed
+from cotap.configs import to_plain
 from cotap.evaluation.disturbance import ConstantLoad, Impact
 from cotap.evaluation.fall_curve import FallCurve
 from cotap.evaluation.fidelity import Fidelity
@@ -32,7 +32,7 @@ from cotap.evaluation.static import StaticStiffness
 if TYPE_CHECKING:
     import numpy as np
 
-    from cotap.envs import H1Env, H1EnvConfig
+    from cotap.envs import H1Env
     from cotap.evaluation.policy import Policy
 
 
@@ -184,11 +184,13 @@ def _prepare(options: CommonOptions, protocol: Any) -> tuple[H1Env, Policy, str]
     import torch
 
     from cotap.agents.checkpoint import require_layout, sha256
-    from cotap.envs import H1Env, H1EnvConfig
+    from cotap.envs import H1Env
     from cotap.evaluation.policy import load_policy
     from cotap.sim import resolve_backend
 
     protocol.check()
+    require_seed("seed", protocol.seed)
+    require_range("threads", options.threads, 0, 4096)
     upper_body = options.laws.configure()
     for name in ("json", "plot", "video"):
         _require_folder(name, getattr(options, name, ""))
@@ -197,7 +199,7 @@ def _prepare(options: CommonOptions, protocol: Any) -> tuple[H1Env, Policy, str]
     path = _checkpoint(options)
     policy = load_policy(path)
     torch.manual_seed(protocol.seed)
-    cfg: H1EnvConfig = protocol.configure(from_plain(H1EnvConfig, policy.config["training"]["env"]))
+    cfg = protocol.configure(policy.env_config)
     cfg.upper_body, cfg.num_threads = upper_body, options.threads
     cfg.backend = resolve_backend(options.backend)
     env = H1Env(cfg)
@@ -237,7 +239,6 @@ def velocity_tracking(options: VelocityTrackingOptions) -> dict[str, Any]:
     import torch
 
     from cotap.agents.checkpoint import write_json
-    from cotap.envs import H1EnvConfig
     from cotap.evaluation.metrics import summaries, tracking_measures, tracking_slopes
     from cotap.evaluation.report import plot_tracking, table
     from cotap.evaluation.rollout import record_rollout
@@ -274,7 +275,7 @@ def velocity_tracking(options: VelocityTrackingOptions) -> dict[str, Any]:
         from cotap.evaluation.render import tour_video
 
         video = Path(options.video)
-        filmed = from_plain(H1EnvConfig, policy.config["training"]["env"])
+        filmed = policy.env_config
         filmed.upper_body = options.laws.configure()
         tour_video(video, filmed, policy.to("cpu"), video.with_suffix(".png"))
     return result

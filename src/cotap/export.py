@@ -8,7 +8,7 @@ from pathlib import Path
 
 import tyro
 
-from cotap.checks import require_positive_int
+from cotap.checks import require_positive_int, require_seed
 
 
 @dataclass
@@ -33,6 +33,7 @@ def main(argv: list[str] | None = None) -> int:
         from cotap.evaluation.policy import default_checkpoint, find_checkpoint
 
         require_positive_int("checks", options.checks)
+        require_seed("seed", options.seed)
         output = Path(options.output)
         if output.suffix != ".onnx":
             raise ValueError(f"--output must end in .onnx, got {options.output!r}")

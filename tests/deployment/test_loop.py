@@ -357,6 +357,12 @@ def _edited(policy_file, tmp_path, name, value):
         ("robot", "g1", "for the robot 'g1'; known: h1"),
         ("joints", [f"joint_{i}" for i in range(19)], "other joints"),
         ("kp", [100.0] * 19, "other kp"),
+        ("torque_limit_nm", [300.0] * 19, "other torque_limit_nm"),
+        ("torque_limit_nm", [0.0] * 19, "other torque_limit_nm"),
+        ("joint_range_rad", [[-1.0, 1.0]] * 19, "other joint_range_rad"),
+        ("velocity_limit_rad_s", [20.0] * 19, "other velocity_limit_rad_s"),
+        ("nominal_height_m", 5.0, "other nominal_height_m: 5.0, here"),
+        ("agents", {"lower": [0, 10], "upper": [10, 19]}, "other agents"),
         ("commands", {"gait": 1.0}, "no field 'gait'"),
         ("law", {"left": {"name": "jelly"}, "right": {}, "ranges": None}, "'jelly' is unknown"),
     ],
@@ -379,6 +385,8 @@ def test_the_trained_law_is_the_default(policy):
     assert (laws.singularity_ratio, laws.torso.model) == (False, "constant")
     earlier = {name: law[name] for name in ("left", "right", "ranges")}
     assert law_config(dataclasses.replace(policy.metadata, law=earlier)).singularity_ratio
+    weaker = [0.5 * limit for limit in policy.metadata.torque_limit_nm]  # as `torque_limit_scale` makes them
+    robot_of(dataclasses.replace(policy.metadata, torque_limit_nm=weaker))
     with pytest.raises(PolicyError, match="h2"):
         robot_of(dataclasses.replace(policy.metadata, robot="h2"))
 

@@ -7,12 +7,11 @@ import pytest
 import torch
 
 from cotap.agents.actors import as_dict
-from cotap.configs import from_plain
 from cotap.deployment.controller import Controller
 from cotap.deployment.engines import EngineConfig, make_engine
 from cotap.deployment.robot import Perturbations, Robot
 from cotap.deployment.scenario import ArmMotion
-from cotap.envs import H1Env, H1EnvConfig
+from cotap.envs import H1Env
 from cotap.envs.upper_body import UpperBodyConfig
 from cotap.evaluation.policy import load_policy, shipped_checkpoint
 
@@ -33,7 +32,7 @@ def batched(
 ) -> tuple[H1Env, list[np.ndarray], list[np.ndarray], dict]:
     """A held robot on a policy that walks in the air: its joints (T, J), torques (T, U), and how it began."""
     policy = load_policy(shipped_checkpoint("base"))
-    cfg = from_plain(H1EnvConfig, policy.config["training"]["env"])
+    cfg = policy.env_config
     cfg.num_envs, cfg.num_threads, cfg.fixed_base, cfg.upper_body = 1, 1, True, laws
     cfg.assist.enabled = cfg.hand_forces.enabled = cfg.blows.enabled = cfg.randomization.enabled = False
     cfg.motions.clips.only, cfg.motions.clips.share = ("punch",), 1.0

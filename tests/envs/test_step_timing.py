@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from cotap.agents.actors import as_dict
-from cotap.configs import from_plain
 from cotap.envs import H1Env, H1EnvConfig, step_timing
 from cotap.envs.commands import HURRY, Catch, CommandConfig, CommandSource
 from cotap.envs.step_timing import BINS, GAIN, HURRY_S, REST_S, StepTiming, feature_reflection, features, risk_at
@@ -174,7 +173,7 @@ def test_it_keeps_robots_on_their_feet() -> None:
     falls = {}
     for timed in (True, False):
         protocol = Impact(num_envs=256, force=(500.0, 0.0, 0.0), random_direction=True, mode="walking")
-        cfg = protocol.configure(from_plain(H1EnvConfig, policy.config["training"]["env"]))
+        cfg = protocol.configure(policy.env_config)
         cfg.commands.step_timing, cfg.upper_body.sampling.enabled = timed, False
         env = H1Env(cfg)
         protocol.prepare(env)

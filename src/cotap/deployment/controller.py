@@ -39,23 +39,34 @@ def robot_of(metadata: PolicyMetadata) -> RobotSpec:
     """The robot that a policy is for.
 
     Raises:
-        PolicyError: cotap does not know it, or knows it with other joints, pose, gains, limits or observation.
+        PolicyError: cotap does not know it, or knows it with another value of an entry that is the robot's own.
     """
     if metadata.robot not in ROBOTS:
         raise PolicyError(f"the policy is for the robot {metadata.robot!r}; known: {', '.join(ROBOTS)}")
     spec = ROBOTS[metadata.robot]()
-    terms = actor_terms(len(spec.joints), len(spec.upper_joints))
+    terms, lower = actor_terms(len(spec.joints), len(spec.upper_joints)), len(spec.lower_joints)
     own = {
         "joints": list(spec.joint_names),
         "default_pose_rad": [j.default_rad for j in spec.joints],
         "kp": [j.kp for j in spec.joints],
         "kd": [j.kd for j in spec.joints],
+        "joint_range_rad": [list(j.range_rad) for j in spec.joints],
+        "velocity_limit_rad_s": [j.velocity_limit_rad_s for j in spec.joints],
+        "nominal_height_m": spec.nominal_height_m,
+        "agents": {"lower": [0, lower], "upper": [lower, len(spec.joints)]},
         "observation terms": [list(t) for t in terms],
     }
     for name, value in own.items():
         found = metadata.observation["terms"] if name == "observation terms" else getattr(metadata, name)
         if found != value:
             raise PolicyError(f"the policy was trained on a {spec.name} with other {name}: {found}, here {value}")
+    limits = np.array([j.torque_limit_nm for j in spec.joints])
+    shares = np.array(metadata.torque_limit_nm) / limits
+    if not (shares[0] > 0.0 and np.allclose(shares, shares[0], rtol=1e-9, atol=0.0)):
+        raise PolicyError(
+            f"the policy was trained on a {spec.name} with other torque_limit_nm: {metadata.torque_limit_nm}, "
+            f"not one factor times {limits.tolist()}"
+        )
     return spec
 
 

@@ -17,8 +17,8 @@ from torch import nn
 
 from cotap import __version__
 from cotap.agents.actors import DualActorCritic
-from cotap.agents.checkpoint import CheckpointError, sha256
-from cotap.configs import from_plain, to_plain
+from cotap.agents.checkpoint import require_layout, sha256
+from cotap.configs import to_plain
 from cotap.deployment.metadata import ACTION, FORMAT, INPUT, TARGETS, PolicyMetadata
 from cotap.deployment.policy import OnnxPolicy
 from cotap.envs import H1EnvConfig
@@ -85,17 +85,11 @@ def export_policy(checkpoint: Path | str, output: Path, checks: int = 1000, seed
         OSError: it cannot be written.
     """
     policy = load_policy(checkpoint)
-    cfg = from_plain(H1EnvConfig, policy.config["training"]["env"])
+    cfg = policy.env_config
     spec = ROBOTS[cfg.robot]()
     history = ObservationHistory(actor_terms(len(spec.joints), len(spec.upper_joints)), 1, cfg.observations.history)
     layout = {"joints": list(spec.joint_names), "terms": [list(t) for t in history.terms], "history": history.steps}
-    for name, value in layout.items():
-        if policy.layout[name] != value:
-            raise CheckpointError(
-                f"checkpoint {str(checkpoint)!r} has other {name}: {policy.layout[name]!r}, here {value!r}"
-            )
-    if policy.model.layout.obs_groups["actor"] != ["policy"]:
-        raise CheckpointError(f"checkpoint {str(checkpoint)!r}: actors read more than their observation")
+    require_layout(checkpoint, policy.layout, layout)
     targets = JointTargets(cfg.actions, spec, build_model(spec), cfg.commands)
     graph = ActorGraph(policy.model, targets, history).eval()
     metadata = describe(cfg, spec, targets, history, policy.model, policy.stage, sha256(checkpoint))

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import json
-import sys
+import reprlib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
+from cotap.checks import is_finite, require_one_of, require_positive_int, require_range
+
 FORMAT = "cotap-policy-1"
 INPUT, TARGETS, ACTION = "observation", "joint_targets", "action"
+ARM_MODES = ("residual", "absolute")
+PER_JOINT = (
+    "default_pose_rad", "action_scale_rad", "kp", "kd", "torque_limit_nm", "joint_range_rad", "velocity_limit_rad_s",
+)  # fmt: skip
 
 
 class PolicyError(ValueError):
@@ -99,29 +105,54 @@ def read_metadata(where: str, properties: Mapping[str, str]) -> PolicyMetadata:
 def _check(m: PolicyMetadata) -> None:
     if m.format != FORMAT:
         raise ValueError(f"format is {m.format!r}; this cotap reads {FORMAT!r}")
-    per_joint = (
-        "default_pose_rad", "action_scale_rad", "kp", "kd", "torque_limit_nm", "joint_range_rad",
-        "velocity_limit_rad_s",
-    )  # fmt: skip
-    for name in per_joint:
-        values = getattr(m, name)
-        if len(values) != len(m.joints):
-            raise ValueError(f"metadata {name} has {len(values)} entries for {len(m.joints)} joints")
-        flat = [v for entry in values for v in entry] if name == "joint_range_rad" else values
-        if not all(_is_finite(v) for v in flat):
-            raise ValueError(f"metadata {name} holds what is not a finite number: {values}")
-    if not isinstance(m.control_dt, (int, float)) or not 1e-4 <= m.control_dt <= 1.0:
-        raise ValueError(f"metadata control_dt must lie in [0.0001, 1.0] s, got {m.control_dt!r}")
+    for name in ("robot", "stage", "checkpoint_sha256", "cotap_version"):
+        _require(isinstance(getattr(m, name), str), name, "a text", getattr(m, name))
+    for name in ("arm_action", "agents", "observation", "commands", "law"):
+        _require(isinstance(getattr(m, name), dict), name, "an object", getattr(m, name))
+    names = isinstance(m.joints, list) and all(isinstance(joint, str) for joint in m.joints)
+    _require(names and len(set(m.joints)) == len(m.joints) > 0, "joints", "a list of different names", m.joints)
+    for name in PER_JOINT:
+        _check_per_joint(name, getattr(m, name), len(m.joints))
+    require_range("metadata action_clip", m.action_clip, 1e-3, 1e6)
+    require_range("metadata nominal_height_m", m.nominal_height_m, 0.0, 100.0)
+    require_range("metadata control_dt", m.control_dt, 1e-4, 1.0)
+    require_positive_int("metadata opset", m.opset)
     for part, entries in (("observation", ("terms", "history")), ("arm_action", ("mode", "reference_lead_s")),
                           ("law", ("left", "right", "ranges"))):  # fmt: skip
         absent = [entry for entry in entries if entry not in getattr(m, part)]
         if absent:
             raise ValueError(f"metadata {part} lacks {absent[0]!r}")
-    for term in m.observation["terms"]:
-        if not (len(term) == 3 and isinstance(term[0], str) and isinstance(term[1], int) and _is_finite(term[2])):
+    require_one_of("metadata arm_action.mode", m.arm_action["mode"], ARM_MODES)
+    require_range("metadata arm_action.reference_lead_s", m.arm_action["reference_lead_s"], 0.0, 1.0)
+    for agent, bounds in m.agents.items():
+        pair = isinstance(bounds, list) and [type(v) for v in bounds] == [int, int]
+        _require(pair and 0 <= bounds[0] < bounds[1] <= len(m.joints), f"agents.{agent}", "[first, last + 1]", bounds)
+    require_positive_int("metadata observation.history", m.observation["history"])
+    terms = m.observation["terms"]
+    _require(isinstance(terms, list), "observation.terms", "a list", terms)
+    for term in terms:
+        if not (isinstance(term, list) and len(term) == 3 and isinstance(term[0], str) and is_finite(term[2])):
             raise ValueError(f"metadata observation has a term that is not (name, width, scale): {term}")
+        require_positive_int(f"metadata observation: width of {term[0]}", term[1])
+    ranges = m.law["ranges"]
+    _require(ranges is None or isinstance(ranges, dict), "law.ranges", "an object or null", ranges)
+    for name, bounds in (ranges or {}).items():
+        pair = isinstance(bounds, list) and len(bounds) == 2 and all(is_finite(v) for v in bounds)
+        _require(pair and bounds[0] <= bounds[1], f"law.ranges.{name}", "[low, high]", bounds)
 
 
-def _is_finite(value: Any) -> bool:
-    """Whether this is a number that a float holds; JSON has larger ones."""
-    return isinstance(value, (int, float)) and abs(value) <= sys.float_info.max
+def _check_per_joint(name: str, values: Any, count: int) -> None:
+    _require(isinstance(values, list), name, "a list", values)
+    if len(values) != count:
+        raise ValueError(f"metadata {name} has {len(values)} entries for {count} joints")
+    if name == "joint_range_rad":
+        pairs = all(isinstance(pair, list) and len(pair) == 2 for pair in values)
+        _require(pairs, name, "pairs [low, high]", values)
+        values = [v for pair in values for v in pair]
+    if not all(is_finite(v) for v in values):
+        raise ValueError(f"metadata {name} holds what is not a finite number: {values}")
+
+
+def _require(fits: bool, name: str, what: str, value: Any) -> None:
+    if not fits:
+        raise ValueError(f"metadata {name} must be {what}, got {reprlib.repr(value)}")

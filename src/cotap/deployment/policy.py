@@ -23,7 +23,7 @@ class OnnxPolicy:
         path: What `python -m cotap.export` wrote.
 
     Raises:
-        PolicyError: the file is missing, is not ONNX, lacks metadata, or has other inputs or outputs than a policy.
+        PolicyError: the file is missing, is not ONNX, lacks metadata, or is another network than that describes.
         ModuleNotFoundError: onnxruntime is not installed.
     """
 
@@ -40,14 +40,17 @@ class OnnxPolicy:
         options.log_severity_level = 4  # what goes wrong is raised; it need not be printed as well
         try:
             self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+            properties = self._session.get_modelmeta().custom_metadata_map
+            inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
         except Exception as error:  # onnxruntime's errors share no base but this
             raise PolicyError(f"{where} cannot be read as ONNX: {str(error).splitlines()[0]}") from error
-        self.metadata = read_metadata(where, self._session.get_modelmeta().custom_metadata_map)
+        self.metadata = read_metadata(where, properties)
         joints, width = len(self.metadata.joints), self.metadata.observation_width
-        self._require(where, "inputs", self._session.get_inputs(), {INPUT: [1, width]})
+        self._require(where, "inputs", inputs, {INPUT: [1, width]})
         wanted = {TARGETS: [1, joints], ACTION: [1, joints]}
-        self._require(where, "outputs", self._session.get_outputs(), wanted)
+        self._require(where, "outputs", outputs, wanted)
         self._input = np.zeros((1, width), dtype=np.float32)
+        self._require_scale(where)
 
     def __call__(self, observation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Joint targets (J,) [rad], for arms that are sent to the reference observed, and the action (J,) to observe
@@ -59,6 +62,21 @@ class OnnxPolicy:
         self._input[0] = observation
         targets, action = self._session.run([TARGETS, ACTION], {INPUT: self._input})
         return np.asarray(targets, dtype=np.float64)[0], np.asarray(action, dtype=np.float64)[0]
+
+    def _require_scale(self, where: str) -> None:
+        """What is fed forward does not read the last action: with another one, targets move by scaled actions alone."""
+        observations, start = np.zeros((2, self._input.shape[1])), 0
+        for name, width, _ in self.metadata.observation["terms"]:
+            end = start + width * self.metadata.observation["history"]
+            observations[1, start:end] = name == "last_action"
+            start = end
+        try:
+            (targets, action), (moved, other) = (self(observation) for observation in observations)
+        except Exception as error:  # as above
+            raise PolicyError(f"{where} cannot be run: {str(error).splitlines()[0]}") from error
+        expected = np.array(self.metadata.action_scale_rad) * (other - action)
+        if not np.allclose(moved - targets, expected, rtol=0.0, atol=1e-4):
+            raise PolicyError(f"{where}: its targets do not move by metadata action_scale_rad times its actions")
 
     @staticmethod
     def _require(where: str, kind: str, found: Sequence[Any], wanted: dict[str, list[int]]) -> None:

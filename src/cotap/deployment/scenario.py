@@ -10,10 +10,12 @@ from typing import Any
 import torch
 
 from cotap.checks import require_finite, require_range
+from cotap.compliance.laws import LawConfig
 from cotap.configs import from_plain
 from cotap.envs.commands import CommandSource
 from cotap.envs.forces import ForceProfile, ScriptedForces
 from cotap.envs.reference import ReferenceConfig, ReferenceMotion
+from cotap.evaluation.law_options import parse_law
 from cotap.robots import RobotSpec
 
 if sys.version_info >= (3, 11):
@@ -111,6 +113,9 @@ class Scenario:
         """Raise ValueError naming the first field that is out of its range."""
         require_range("seconds", self.seconds, 0.02, 36000.0)
         self.arms.check(spec)
+        for side in ("left", "right"):
+            if text := getattr(self, side):
+                parse_law(side, text, LawConfig()).check()
         for i, command in enumerate(self.command):
             command.check(f"command[{i}]")
             if i and command.at < self.command[i - 1].at:
@@ -146,7 +151,7 @@ def load_scenario(path: Path | str, spec: RobotSpec) -> Scenario:
         data = tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise ValueError(f"scenario {str(path)!r} does not exist") from error
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # not text, not TOML, or nested without end
         raise ValueError(f"scenario {str(path)!r} is not TOML: {error}") from error
     try:
         scenario = from_plain(Scenario, data)

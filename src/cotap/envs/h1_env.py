@@ -14,7 +14,14 @@ import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
-from cotap.checks import require_all_finite, require_one_of, require_positive_int, require_range, require_shape
+from cotap.checks import (
+    require_all_finite,
+    require_one_of,
+    require_positive_int,
+    require_range,
+    require_seed,
+    require_shape,
+)
 from cotap.compliance.kinematics import ChainPose
 from cotap.compliance.laws import LawConfig
 from cotap.envs.actions import ActionConfig, JointTargets
@@ -108,6 +115,7 @@ class H1EnvConfig:
         """Raise ValueError naming the first field that is out of its range."""
         require_positive_int("num_envs", self.num_envs)
         require_positive_int("substeps", self.substeps)
+        require_seed("seed", self.seed)
         require_one_of("robot", self.robot, ROBOTS.keys())
         resolve_backend(self.backend)
         require_one_of("collision", self.collision, COLLISIONS)
@@ -274,6 +282,7 @@ class H1Env(VecEnv):
 
     def reset_alike(self, seed: int) -> TensorDict:
         """Restart every world with the same random numbers, so that all start in one state; return the observations."""
+        require_seed("seed", seed)
         for world in range(self.num_envs):
             self.rng.manual_seed(seed)
             self._restart(torch.arange(self.num_envs, device=self.device) == world)

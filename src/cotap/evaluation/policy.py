@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -12,6 +13,8 @@ import torch
 from cotap.agents.actors import AgentLayout, DualActorCritic
 from cotap.agents.checkpoint import MALFORMED, CheckpointError, load_checkpoint, require_parts
 from cotap.checks import require_one_of, require_positive_int
+from cotap.configs import from_plain
+from cotap.envs import H1EnvConfig
 
 CHECKPOINTS = ("base", "cotap", "facet", "cotap-no-ratio", "cotap-torque-critic", "cotap-goals")
 """Names under which checkpoints are shipped: both stages, the second under FACET's law, and its ablations."""
@@ -52,8 +55,13 @@ class Policy:
 
     model: DualActorCritic
     layout: dict[str, Any]
-    config: dict[str, Any]
     stage: str
+    _env_config: H1EnvConfig
+
+    @property
+    def env_config(self) -> H1EnvConfig:
+        """The environment that it was trained in, simulated by whatever there is here; a copy, free to be changed."""
+        return copy.deepcopy(self._env_config)
 
     def to(self, device: torch.device | str) -> Policy:
         """The same policy, its networks moved to `device`."""
@@ -67,20 +75,47 @@ class Policy:
 
 
 def load_policy(path: Path | str) -> Policy:
-    """Load a checkpoint's networks for use.
+    """Load a checkpoint's networks for use, and the environment's config.
 
     Raises:
         CheckpointError: the file cannot be used.
     """
     content = load_checkpoint(path)
     require_parts(path, content, ("layout", "model", "agents", "config", "kind"))
+    env_config = _env_config_of(path, content)
     layout, weights, agents = content["layout"], content["model"], content["agents"]
     try:
         widths = content["config"]["training"]["ppo"]["hidden"]
         hidden = tuple(require_positive_int(f"ppo.hidden[{i}]", width) for i, width in enumerate(widths))
-        model = DualActorCritic(AgentLayout.from_plain(agents), hidden, 1.0)
+        networks = AgentLayout.from_plain(agents)
+        _require_fitting(networks, layout)
+        model = DualActorCritic(networks, hidden, 1.0)
         model.load_state_dict(weights)
     except MALFORMED as error:
         raise CheckpointError(f"checkpoint {str(path)!r} has networks that do not fit its config: {error}") from error
     model.eval()
-    return Policy(model, layout, content["config"], content["kind"])
+    return Policy(model, layout, content["kind"], env_config)
+
+
+def _require_fitting(networks: AgentLayout, layout: dict[str, Any]) -> None:
+    """Raise ValueError unless actors read the observation that `layout` tells of, and move its joints in order."""
+    width = layout["history"] * sum(width for _, width, _ in layout["terms"])
+    if networks.obs_groups["actor"] != ["policy"] or networks.width("actor") != width:
+        raise ValueError(f"actors do not read the layout's observation of {width} numbers alone")
+    parts = networks.action_slices.values()
+    if [*(s.start for s in parts), len(layout["joints"])] != [0, *(s.stop for s in parts)]:
+        raise ValueError(
+            f"actions of {networks.action_slices} are not those of {len(layout['joints'])} joints in order"
+        )
+
+
+def _env_config_of(path: Path | str, content: dict[str, Any]) -> H1EnvConfig:
+    try:
+        cfg = from_plain(H1EnvConfig, content["config"]["training"]["env"])
+        cfg.backend = "auto"  # the one it was trained on may not be installed here
+        cfg.check()
+    except KeyError as error:
+        raise CheckpointError(f"checkpoint {str(path)!r} has no {error} in its config") from error
+    except MALFORMED as error:
+        raise CheckpointError(f"checkpoint {str(path)!r} has no usable environment config: {error}") from error
+    return cfg

@@ -13,7 +13,6 @@ import torch
 from cotap.agents.actors import as_dict
 from cotap.agents.checkpoint import require_layout, sha256
 from cotap.compliance.laws import LAWS, LawConfig
-from cotap.configs import from_plain
 from cotap.envs import H1Env, H1EnvConfig
 from cotap.envs.commands import STEADY_RAD
 from cotap.envs.reference import REST
@@ -46,7 +45,7 @@ class Session:
         self._checkpoints, self._seed = dict(checkpoints), seed
         first = next(iter(self._checkpoints))
         policy = load_policy(self._checkpoints[first])
-        self.env = H1Env(play_config(from_plain(H1EnvConfig, policy.config["training"]["env"])))
+        self.env = H1Env(play_config(policy.env_config))
         self._loaded: dict[str, Policy] = {}
         self._policies = [self._policy(first)] * len(ROBOTS)
         env = self.env
@@ -93,7 +92,7 @@ class Session:
 
         The environment, and with it what is fed forward to the legs, is that of the first checkpoint.
         """
-        trained = from_plain(H1EnvConfig, self._policy(checkpoint).config["training"]["env"]).commands
+        trained = self._policy(checkpoint).env_config.commands
         here = self.env.cfg.commands
         differ = [
             f"{name} {getattr(trained, name)} (here {getattr(here, name)})"
