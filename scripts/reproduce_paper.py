@@ -681,9 +681,10 @@ HEAD = """# The paper's tables and figures, measured here
 Written by `{command}`: do not edit. {envs} worlds a row unless said otherwise; means with bootstrap 95 %
 intervals over the worlds that stood (shares of falls: all worlds, to the end of the episode, Wilson's). Impact: 500 N
 for 50 ms at the left hand, +x in stance, in a random horizontal direction while walking at 0.5 m/s; window 1 s from the
-onset at 1 s of 3 s; friction, masses, gains and delay randomised; H1's own torque limits unless a factor is
-named. In other simulators: [sim to sim](sim_to_sim.md). The paper's figures (Isaac Gym, 4096 worlds, window and torque
-limits not given) stand beside ours: orderings and ratios are what compares, not digits.
+onset at 1 s of 3 s; friction, masses, gains and delay randomised; H1's own torque limits unless a factor is named.
+Policy `base` is simulated as it was trained, with feet and floor alone colliding; all others collide whole. In other
+simulators: [sim to sim](sim_to_sim.md). The paper's figures (Isaac Gym, 4096 worlds, window and torque limits not
+given) stand beside ours: orderings and ratios are what compares, not digits.
 """
 
 
