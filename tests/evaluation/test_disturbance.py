@@ -195,6 +195,23 @@ def test_a_world_is_what_it_is_in_any_company():
         assert two[0] <= one[1], name
 
 
+def test_the_same_seed_gives_the_same_json_and_more_threads_the_same_figures(tmp_path):
+    """Bit for bit with one number of threads; another may add in another order, and agrees within the intervals."""
+    results = []
+    for i, threads in enumerate((1, 1, 2)):
+        out = tmp_path / f"{i}.json"
+        arguments = ["--num-envs", "32", "--seed", "3", "--episode-seconds", "2", "--json", str(out)]
+        assert main(["impact", *arguments, "--threads", str(threads)]) == 0
+        results.append(json.loads(out.read_text()))
+        results[-1].pop("seconds")
+    assert results[0] == results[1]
+    assert results[0]["metrics"]["e_torso"]["std"] > 0.0  # worlds differ, so intervals say something
+    for name in ("e_torso", "e_ee", "e_ee_hit", "j_upper", "e_upper"):
+        one, two = (r["metrics"][name]["ci95"] for r in results[1:])
+        assert one[0] <= two[1], name
+        assert two[0] <= one[1], name
+
+
 @pytest.mark.parametrize("protocol", ["impact", "constant-load"])
 def test_the_command_writes_what_was_asked_for(protocol, tmp_path, capsys):
     out = tmp_path / "out.json"
