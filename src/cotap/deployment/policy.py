@@ -72,7 +72,7 @@ class OnnxPolicy:
             start = end
         try:
             (targets, action), (moved, other) = (self(observation) for observation in observations)
-        except Exception as error:  # as above
+        except Exception as error:  # a graph that cannot be run fails in onnxruntime's own ways, which share no base
             raise PolicyError(f"{where} cannot be run: {str(error).splitlines()[0]}") from error
         expected = np.array(self.metadata.action_scale_rad) * (other - action)
         if not np.allclose(moved - targets, expected, rtol=0.0, atol=1e-4):
