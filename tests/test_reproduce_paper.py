@@ -23,7 +23,9 @@ def book(tmp_path: Path) -> rp.Book:
 
 
 def measured(mean: float, half: float) -> dict:
-    return {"metrics_without_falls": {"j_upper": {"mean": mean, "std": 1.0, "ci95": [mean - half, mean + half]}}}
+    summary = {"mean": mean, "std": 1.0, "ci95": [mean - half, mean + half]}
+    measures = dict.fromkeys(("j_upper", "e_torso"), summary)
+    return {"metrics_without_falls": measures, "settings": {"seed": 0}}
 
 
 @pytest.mark.parametrize(
@@ -67,7 +69,7 @@ def test_an_error_without_bound_is_the_largest(book, monkeypatch):
               "error_quantiles": {"50": 0.021, "95": 0.15}}  # fmt: skip
     monkeypatch.setattr(book, "run", lambda *_, **__: result)
     rp.fidelity(book, True)
-    assert "| cotap | joint | no bound | 30% / no bound / - | 2.1%, 15% | 3 | 50% | 1 of 12 |" in book.lines
+    assert "| cotap | joint | no bound | -30% / no bound / - | 2.1%, 15% | 3 | 50% | 1 of 12 |" in book.lines
 
 
 def test_the_papers_tables_have_seven_rows_each():
@@ -85,22 +87,41 @@ def test_page_and_json_are_written(book, tmp_path):
     assert written["settings"] == {"seed": 7}
 
 
-def test_only_evaluations_of_the_same_policy_and_size_are_kept(book, monkeypatch):
-    """Neither one of another checkpoint nor one of other worlds is taken for what was asked for."""
+def test_only_evaluations_of_the_same_policy_and_settings_are_kept(book, monkeypatch):
+    """Neither one of another checkpoint nor one of other worlds or options is taken for what was asked for."""
     asked = []
 
     def evaluate(arguments):
         asked.append(arguments)
-        return {"num_envs": book.envs}
+        return {"settings": {"checkpoint_sha256": OWN}}
 
     monkeypatch.setattr("cotap.evaluate.evaluate", evaluate)
-    book.reuse = True
     path = book.evaluations / "row.json"
-    for sha, worlds, kept in (("other", book.envs, False), (OWN, book.envs + 1, False), (OWN, book.envs, True)):
+    book.run("row", "base", "impact", "--alpha", "0.5")
+    written = json.loads(path.read_text())
+    assert "--worlds" in written["arguments"]
+    book.reuse = True
+    for changed, kept in (
+        ({}, True),
+        ({"settings": {"checkpoint_sha256": "other"}}, False),
+        ({"arguments": [*written["arguments"], "--seed", "1"]}, False),
+    ):
         asked.clear()
-        path.write_text(json.dumps({"num_envs": worlds, "settings": {"checkpoint_sha256": sha}}))
-        book.run("row", "base", "impact")
+        path.write_text(json.dumps(written | changed))
+        book.run("row", "base", "impact", "--alpha", "0.5")
         assert (not asked) == kept
+
+
+def test_differences_say_what_was_not_measured(book):
+    rp.differences(book)
+    page = "\n".join(book.lines)
+    assert "(not measured)" in page
+    assert "of 51 kg by 0.49 m/s" in page
+    curve = {"time": [-0.02, 0.02, 0.1, 0.2, 0.5, 1.0], "arm_torque": [9.0, 4.0, 2.0, 6.0, 0.0, 8.0]}
+    book.results["impact-stance-cotap-K-100"] = measured(1.0, 0.1) | {"curve": curve}
+    book.results["impact-stance-cotap-PD-kp-100"] = measured(3.0, 0.1) | {"curve": curve}
+    rp.differences(book)
+    assert "| K 100 | 3.0 | 4.0 | 4.0 | 4.0 |" in book.lines
 
 
 @pytest.mark.slow

@@ -58,6 +58,8 @@ def read(path: str) -> dict[str, Any]:
     for part in ("metrics", "metrics_without_falls"):
         for name, summary in content.get(part, {}).items():
             _require_summary(f"{path!r}: {part}.{name}", summary)
+    if "worlds" in content:
+        _require_worlds(f"{path!r}: worlds", content["worlds"])
     return content
 
 
@@ -73,11 +75,24 @@ def _require_summary(where: str, summary: Any) -> None:
         raise ValueError(f"{where}.ci95 must be two finite numbers or null, got {interval!r:.80}")
 
 
+def _require_worlds(where: str, worlds: Any) -> None:
+    """Raise ValueError unless these are lists of numbers or nulls, all of one length, `stood` among them."""
+    if not isinstance(worlds, dict) or "stood" not in worlds or not all(isinstance(v, list) for v in worlds.values()):
+        raise ValueError(f"{where} must be lists by name, stood among them")
+    for name, values in worlds.items():
+        if len(values) != len(worlds["stood"]):
+            raise ValueError(f"{where}.{name} has {len(values)} worlds, stood has {len(worlds['stood'])}")
+        if wrong := [v for v in values if v is not None and not is_finite(v)]:
+            raise ValueError(f"{where}.{name} must be finite numbers or null, got {wrong[0]!r:.80}")
+
+
 def compare(a: dict[str, Any], b: dict[str, Any], without_falls: bool = False) -> dict[str, Any]:
     """Differences of all measures that both have, and the settings in which they differ.
 
-    The interval of a difference follows from those of its terms, taken to be independent (the square-and-add method of
-    Zou and Donner 2008, Newcombe's for shares): no more than two JSON files is needed.
+    Where both have every world's figures (`--worlds`) of as many worlds and one seed, worlds are compared one by one:
+    what friction, motion or direction does to a measure it does to both, and drops out. Otherwise the interval of a
+    difference follows from those of its terms, taken to be independent (the square-and-add method of Zou and Donner
+    2008, Newcombe's for shares).
 
     Raises:
         ValueError: the protocols differ.
@@ -85,7 +100,8 @@ def compare(a: dict[str, Any], b: dict[str, Any], without_falls: bool = False) -
     if a["protocol"] != b["protocol"]:
         raise ValueError(f"protocols differ: {a['protocol']!r} and {b['protocol']!r}")
     key = "metrics_without_falls" if without_falls else "metrics"
-    rows = {name: difference(m, b[key][name]) for name, m in a.get(key, {}).items() if name in b.get(key, {})}
+    names = [name for name in a.get(key, {}) if name in b.get(key, {})]
+    rows = {name: measure_difference(a, b, name, without_falls) for name in names}
     old, new = (_flat(x["settings"] | {"method": x.get("method"), "window": x.get("window")}) for x in (a, b))
     settings = {
         name: [old.get(name), new.get(name)]
@@ -93,6 +109,41 @@ def compare(a: dict[str, Any], b: dict[str, Any], without_falls: bool = False) -
         if old.get(name) != new.get(name)
     }
     return {"protocol": a["protocol"], "differences": rows, "settings": settings}
+
+
+def measure_difference(a: dict[str, Any], b: dict[str, Any], name: str, without_falls: bool) -> dict[str, Any]:
+    """`b - a` of one measure of two evaluations, world by world where both have them; as `difference`."""
+    worlds_a, worlds_b = a.get("worlds", {}), b.get("worlds", {})
+    seeds = [x["settings"].get("seed") for x in (a, b)]
+    paired = name in worlds_a and name in worlds_b and len(worlds_a[name]) == len(worlds_b[name])
+    if not paired or seeds[0] is None or seeds[0] != seeds[1]:
+        key = "metrics_without_falls" if without_falls else "metrics"
+        return difference(a[key][name], b[key][name])
+    return paired_difference(worlds_a, worlds_b, name, without_falls)
+
+
+def paired_difference(a: dict[str, Any], b: dict[str, Any], name: str, without_falls: bool) -> dict[str, Any]:
+    """Mean of `b - a` over the worlds that have the measure in both, with its bootstrap interval.
+
+    Args:
+        a: Lists by measure, a figure or null for every world.
+        b: The same of the other evaluation.
+        name: The measure.
+        without_falls: Leave out worlds that fell in either.
+    """
+    import torch
+
+    from cotap.evaluation.metrics import summarize
+
+    old, new = (torch.tensor([math.nan if v is None else v for v in x[name]]) for x in (a, b))
+    both = torch.isfinite(old) & torch.isfinite(new)
+    if without_falls:
+        both &= torch.tensor(a["stood"]).bool() & torch.tensor(b["stood"]).bool()
+    summary = summarize((new - old)[both])
+    if summary["mean"] is None:
+        return {"a": None, "b": None, "difference": None, "ci95": None, "reason": "no world has it in both"}
+    means = {"a": float(old[both].mean()), "b": float(new[both].mean())}
+    return means | {"difference": summary["mean"], "ci95": summary["ci95"], "pairs": summary["n"]}
 
 
 def difference(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
@@ -131,6 +182,8 @@ def table(result: dict[str, Any]) -> str:
             f"| {name} | {row['a']:.4f} | {row['b']:.4f} | {row['difference']:+.4f} | {low:+.4f} to {high:+.4f} "
             f"| {differs} |"
         )
+    if pairs := [row["pairs"] for row in result["differences"].values() if "pairs" in row]:
+        lines += ["", f"Compared world by world, {min(pairs)} to {max(pairs)} worlds a measure."]
     lines += ["", *(f"{name}: {old} -> {new}" for name, (old, new) in result["settings"].items())]
     return "\n".join(lines)
 

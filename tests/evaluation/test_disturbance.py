@@ -16,6 +16,7 @@ from cotap.evaluation.disturbance import (
     Impact,
     curve,
     falls_by_time,
+    load_overshoot,
     recovery,
     response_measures,
     window_measures,
@@ -100,6 +101,19 @@ def test_displacement_is_what_the_load_adds():
     assert float(m["displacement_z"][0]) == pytest.approx(-0.05)
     assert float(m["displacement_x"][0]) == 0.0
     assert m["displacement_z"][1].isnan()
+
+
+def test_a_load_overshoots_by_what_it_carries_the_hand_beyond_its_rest():
+    """From 0.01 m to rest 0.1 m lower, at first 0.13 m: by 0.3; to the side, and after a fall, nothing counts."""
+    t = trajectory(steps=200, worlds=2)
+    t.hand_offset[:, :, 0, 2] = 0.01
+    t.hand_offset[50:, :, 0, 2] = -0.09
+    t.hand_offset[60:65, :, 0, 2] = -0.12
+    t.hand_offset[60:65, :, 0, 0] = 0.5
+    t.fell[100, 1] = True
+    over = load_overshoot(t, 50, 150, 200, LEFT)
+    assert float(over[0]) == pytest.approx(0.3, abs=1e-5)
+    assert over[1].isnan()
 
 
 def test_falls_are_told_apart_by_when():
@@ -227,7 +241,21 @@ def test_the_command_writes_what_was_asked_for(protocol, tmp_path, capsys):
     assert result["episode"]["metrics"]["j_upper"]["n"] == 16
     assert sum(result["falls"].values()) == result["num_falls"]
     assert (tmp_path / "plot.png").stat().st_size > 5000
+    assert ("load_overshoot" in result["metrics"]) == (protocol == "constant-load")
+    assert "worlds" not in result
     assert "| e_ee_hit |" in capsys.readouterr().out
+
+
+def test_every_worlds_figures_are_those_behind_the_means(tmp_path):
+    out = tmp_path / "out.json"
+    assert main(["impact", "--num-envs", "16", "--threads", "1", "--worlds", "--json", str(out)]) == 0
+    result = json.loads(out.read_text())
+    worlds, stood = result["worlds"], torch.tensor(result["worlds"]["stood"]).bool()
+    assert int((~stood).sum()) == result["num_falls"]
+    for name in ("e_torso", "e_ee_hit", "j_upper"):
+        values = torch.tensor(worlds[name], dtype=torch.float64)
+        assert float(values.mean()) == pytest.approx(result["metrics"][name]["mean"], rel=1e-5)
+        assert float(values[stood].mean()) == pytest.approx(result["metrics_without_falls"][name]["mean"], rel=1e-5)
 
 
 @pytest.mark.parametrize(

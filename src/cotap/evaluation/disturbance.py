@@ -86,6 +86,8 @@ class Impact(Scenario):
         release = onset + round(self.duration / t.dt)
         if any(self.force) and release < end:
             window |= transient_measures(t, onset, release, end, hit, BEFORE_S)
+        elif any(self.force):
+            window["load_overshoot"] = load_overshoot(t, onset, begin, end, hit)
         episode = window_measures(t, 0, len(t.fell), hit)
         return {
             "falls": falls_by_time(t, onset, end),
@@ -98,6 +100,7 @@ class Impact(Scenario):
                 "window": {"start": 0.0, "end": self.seconds},
             },
             "curve": curve(t, onset, hit),
+            "worlds": per_world(window, stood),
         } | self._stiffness(env, window, stood)
 
     def _stiffness(self, env: H1Env, measures: dict[str, torch.Tensor], stood: torch.Tensor) -> dict[str, Any]:
@@ -188,6 +191,18 @@ def window_measures(t: Trajectory, begin: int, end: int, hit: list[int]) -> dict
     }
 
 
+def per_world(measures: dict[str, torch.Tensor], stood: torch.Tensor) -> dict[str, list[float | None]]:
+    """Measures (N,) world by world, to six digits, null where a world has none; and whether it `stood` to the end."""
+
+    def plain(value: float) -> float | None:
+        return float(f"{value:.6g}") if math.isfinite(value) else None
+
+    return {
+        "stood": [float(s) for s in stood.tolist()],
+        **{name: [plain(v) for v in values.double().tolist()] for name, values in measures.items()},
+    }
+
+
 def response_measures(t: Trajectory, onset: int, begin: int, end: int, hit: list[int]) -> dict[str, torch.Tensor]:
     """How far the hands in `hit` went and how soon they were back, per world, (N,) each.
 
@@ -204,6 +219,20 @@ def response_measures(t: Trajectory, onset: int, begin: int, end: int, hit: list
         "recovered_fraction": recovered,
         **{f"displacement_{axis}": moved[:, i] for i, axis in enumerate("xyz")},
     }
+
+
+def load_overshoot(t: Trajectory, onset: int, begin: int, end: int, hit: list[int]) -> torch.Tensor:
+    """How far beyond its rest a load first carries the hands in `hit`, over the way to that rest, (N,).
+
+    Rest is the mean displacement from `begin` to before `end`; what counts is the displacement along it. NaN for a
+    world that fell before the window's end.
+    """
+    offset = t.hand_offset[:, :, hit].mean(2)
+    moved = offset[onset:end] - offset[onset - round(BEFORE_S / t.dt) : onset].mean(0)
+    rest = moved[begin - onset :].mean(0)
+    way = rest.norm(dim=1).clamp_min(1e-9)
+    furthest = (moved * (rest / way.unsqueeze(1))).sum(2).amax(0)
+    return torch.where(t.alive()[end - 1], furthest / way - 1.0, torch.full_like(way, math.nan))
 
 
 def recovery(error: torch.Tensor, alive: torch.Tensor, onset: int, dt: float) -> tuple[torch.Tensor, torch.Tensor]:
@@ -243,6 +272,7 @@ def curve(t: Trajectory, onset: int, hit: list[int]) -> dict[str, list[float]]:
         **{f"hand_displacement_{axis}_std": moved[..., i].std(1, correction=0) for i, axis in enumerate("xyz")},
         "torso_velocity_error": velocity[..., :2].norm(dim=2).mean(1),
         **{f"velocity_error_{axis}": velocity[..., i].mean(1) for i, axis in enumerate("xy")},
+        **{f"velocity_error_{axis}_abs": velocity[..., i].abs().mean(1) for i, axis in enumerate("xy")},
         "arm_torque": t.arm_torque[begin:, stood].norm(dim=2).mean(1),
     }
     return {name: values.tolist() for name, values in rows.items()}

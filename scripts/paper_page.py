@@ -1,0 +1,187 @@
+"""The page that `reproduce_paper.py` writes: evaluations run or kept, numbers and orderings in words, figures."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+PAIRED = ("impact", "constant-load")
+"""Protocols that write every world's figures, so that two evaluations are compared world by world."""
+
+
+@dataclass
+class Book:
+    """Runs evaluations, keeps their results, and collects the page."""
+
+    out: Path
+    evaluations: Path
+    envs: int
+    threads: int
+    reuse: bool
+    lines: list[str] = field(default_factory=list)
+    results: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+    def run(self, name: str, checkpoint: str, *args: str, envs: int | None = None) -> dict[str, Any] | None:
+        """An evaluation's result under `name`; None where its checkpoint is not shipped."""
+        from cotap.evaluate import evaluate
+        from cotap.evaluation.policy import shipped_names
+
+        if checkpoint not in shipped_names():
+            return None
+        from cotap.agents.checkpoint import sha256, write_json
+        from cotap.evaluation.policy import checkpoint_path
+
+        path = self.evaluations / f"{name}.json"
+        worlds = [] if envs == 0 else ["--num-envs", str(envs or self.envs)]
+        asked = [args[0], *worlds, "--checkpoint", checkpoint, *(["--worlds"] if args[0] in PAIRED else []), *args[1:]]
+        sha = sha256(checkpoint_path(checkpoint))
+        kept = json.loads(path.read_text()) if self.reuse and path.is_file() else {}
+        if kept.get("arguments") != asked or kept["settings"]["checkpoint_sha256"] != sha:
+            print(f"\n{name}")
+            kept = evaluate([*asked, "--threads", str(self.threads)]) | {"arguments": asked}
+            write_json(path, kept)
+        self.results[name] = kept
+        return kept
+
+    def add(self, *lines: str) -> None:
+        """Add lines to the page."""
+        self.lines += lines
+
+    def figure(self, name: str, caption: str) -> Path:
+        """Where a figure goes; its place on the page is here."""
+        self.add("", f"![{caption}](results/{name}.png)", "", f"*{caption}*")
+        return self.out / f"{name}.png"
+
+
+def number(m: dict[str, Any] | None, digits: int = 3) -> str:
+    """A measure as mean and interval."""
+    if m is None or m["mean"] is None:
+        return "not measured" if m is None else m["reason"]
+    if m["ci95"] is None:
+        return f"{m['mean']:.{digits}f} ({m['reason']})"
+    low, high = m["ci95"]
+    return f"{m['mean']:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
+
+
+def fallen(result: dict[str, Any]) -> str:
+    """Share of worlds that fell until the end of the episode, not in the window alone, with Wilson's interval."""
+    from cotap.evaluation.metrics import wilson_interval
+
+    share, worlds = result["num_falls"] / result["num_envs"], result["num_envs"]
+    low, high = wilson_interval(share, worlds)
+    return f"{share:.2f} ({low:.2f} to {high:.2f})"
+
+
+def missing(checkpoint: str) -> str:
+    """What stands where a checkpoint would be measured that is not shipped."""
+    return f"checkpoint `{checkpoint}` is not shipped with this release: not measured"
+
+
+def ordering(book: Book, claim: str, smaller: str, larger: str, measure: str, digits: int = 3) -> None:
+    """Whether a measure is larger in one result than in another, in a line of the page."""
+    from cotap.compare import measure_difference
+
+    if smaller not in book.results or larger not in book.results:
+        book.add(f"- {claim}: not measured")
+        return
+    d = measure_difference(book.results[smaller], book.results[larger], measure, without_falls=True)
+    if d["difference"] is None:
+        book.add(f"- {claim}: not measured ({d['reason']})")
+        return
+    low, high = d["ci95"]
+    verdict = "holds" if low > 0.0 else "does not hold" if high < 0.0 else "cannot be told apart"
+    numbers = f"{d['difference']:+.{digits}f} ({low:+.{digits}f} to {high:+.{digits}f})"
+    book.add(f"- {claim}: **{verdict}**, difference {numbers}")
+
+
+def slug(text: str) -> str:
+    """A file name of a row's name."""
+    return "".join(c if c.isalnum() or c == "." else "-" for c in text).replace("--", "-").strip("-")
+
+
+def plot_curves(path: Path, curves: dict[str, tuple[list[float], list[float]]], x: str, y: str) -> None:
+    """Several curves on one axis."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    from cotap.evaluation.report import save_figure
+
+    figure, axis = plt.subplots(figsize=(8.0, 4.2), constrained_layout=True)
+    for name, (time, values) in curves.items():
+        if time:
+            axis.plot(time, values, label=name)
+    axis.axvline(0.0, color="0.6", lw=0.8)
+    axis.set(xlabel=x, ylabel=y)
+    axis.grid(alpha=0.2)
+    axis.legend(frameon=False)
+    save_figure(figure, path)
+
+
+def picture(book: Book, name: str, caption: str, shots: list[tuple[str, list[str], tuple[float, ...]]]) -> None:
+    """A row of pictures; where the machine cannot render, the page says so."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    from cotap.evaluate import pictures
+    from cotap.evaluation.render import RenderingUnavailable
+    from cotap.evaluation.report import save_figure
+
+    images = []
+    try:
+        for label, args, times in shots:
+            images += [
+                (f"{label} {t:g} s".strip(), image) for t, image in zip(times, pictures(args, times), strict=True)
+            ]
+    except RenderingUnavailable as error:
+        book.add("", f"{caption} Not drawn: {error}")
+        return
+    figure, axes = plt.subplots(
+        1, len(images), figsize=(2.6 * len(images), 2.9), constrained_layout=True, squeeze=False
+    )
+    for axis, (label, image) in zip(axes[0], images, strict=True):
+        axis.imshow(image)
+        axis.set_title(label, fontsize=10)
+        axis.axis("off")
+    save_figure(figure, book.figure(name, caption))
+
+
+def write(folder: Path, book: Book) -> None:
+    """The page and all results in one file."""
+    from cotap.agents.checkpoint import write_json
+    from cotap.files import write_atomically
+
+    text = "\n".join(book.lines) + "\n"
+    write_atomically(folder / "results.md", lambda p: p.write_text(text, encoding="utf-8"))
+    kept = (
+        "protocol",
+        "method",
+        "num_envs",
+        "num_falls",
+        "seconds",
+        "metrics",
+        "metrics_without_falls",
+        "window",
+        "fidelity",
+        "largest_error",
+        "num_wrong_way",
+        "error_quantiles",
+        "coverage",
+        "impulse_50",
+        "fall_curve",
+        "effective_stiffness",
+        "by_change",
+        "arguments",
+    )
+    results = {
+        name: {key: result[key] for key in kept if key in result}
+        | {"settings": {key: value for key, value in result["settings"].items() if key != "env"}}
+        for name, result in book.results.items()
+    }  # the environment is in the checkpoint
+    write_json(folder / "results.json", results)
+    print(f"\nwritten: {folder / 'results.md'}")
