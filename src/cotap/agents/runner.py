@@ -249,7 +249,8 @@ class DualRunner(OnPolicyRunner):
         self, path: str, *_: Any, map_location: str | None = None, other_terms: bool = False, **__: Any
     ) -> dict:  # fmt: skip
         """Load a checkpoint. What it lacks (a shipped one has no optimiser or simulator states) starts afresh; worlds
-        that do, among them those of another number of worlds or ranks, begin where its curricula had come to.
+        that do, among them those of another number of worlds or ranks or of other collisions, begin where its
+        curricula had come to.
 
         Args:
             path: The file.
@@ -276,7 +277,7 @@ class DualRunner(OnPolicyRunner):
             mine = self._share_of(content)
             if content["learner"]:
                 self._take_random_state(mine)
-            if mine["env"] and mine["env"]["episode_length"].shape[0] == env.num_envs:
+            if self._are_ours(mine["env"], content["config"]):
                 env.load_state_dict(mine["env"])
             else:
                 env.samples = content["samples"]
@@ -296,6 +297,13 @@ class DualRunner(OnPolicyRunner):
         states = [content, *content.get("others", [])]
         same_number = len(states) == self.ranks.size
         return states[self.ranks.rank] if same_number else {"env": {}}
+
+    def _are_ours(self, worlds: dict[str, Any], config: dict[str, Any]) -> bool:
+        """Whether these worlds of a run with that config are as many as ours, and models of the same shapes."""
+        if not worlds or worlds["episode_length"].shape[0] != self.env.num_envs:
+            return False
+        theirs, own = (c.get("training", {}).get("env", {}).get("collision") for c in (config, self.config))
+        return theirs == own
 
     def _own_state(self, worlds: bool = True) -> dict[str, Any]:
         """What is this rank's own."""

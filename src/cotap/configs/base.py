@@ -59,20 +59,25 @@ def paper() -> BaseTraining:
 
 def robust(training: BaseTraining | None = None) -> BaseTraining:
     """What a policy that walks learns next, on top of its own config or else of the default: to take blows and loads
-    on its hands, and to step where standing does not do any more."""
+    on its hands, to step where standing does not do any more, and to keep its legs out of each other's way."""
     training = copy.deepcopy(training) if training else default()
     env = training.env
+    # Legs that may pass through each other learn to, and trip over each other anywhere else.
+    env.collision = "full"
+    env.commands.step_apart_m, env.commands.step_clear_m = 0.04, 0.15
     env.commands.steady_rad = STEADY_RAD
     env.commands.step_timing = True
-    env.commands.stand_probability = 0.4
+    env.commands.stand_probability = 0.3
     env.blows.enabled = True
-    env.hand_forces.episode_share = 0.5
+    env.hand_forces.episode_share = 0.6
     env.hand_forces.curriculum_start = 0.2
     env.hand_forces.curriculum_back = 0.1
     env.rewards.lower.foot_slip = -1.5
-    env.rewards.lower.track_mean_velocity = 3.0
-    env.rewards.lower.track_mean_yaw_rate = 1.2
+    # Blows teach caution, and caution is slow.
+    env.rewards.lower.track_mean_velocity = 6.0
+    env.rewards.lower.track_mean_yaw_rate = 2.4
     training.ppo.least_std = 0.12
+    training.ppo.desired_kl = 0.01
     training.runner.iterations = 2085
     return training
 

@@ -30,7 +30,6 @@ def default(base: BaseTraining) -> DistillTraining:
     env = training.env
     env.assist.enabled = False
     env.commands.step_timing = True
-    # Legs that may pass through each other learn to, and trip over each other anywhere else.
     env.collision = "full"
     env.commands.step_apart_m, env.commands.step_clear_m = 0.04, 0.15
     for law in (env.upper_body.left, env.upper_body.right):
@@ -47,7 +46,6 @@ def default(base: BaseTraining) -> DistillTraining:
     env.rewards.upper.arm_residual = -10.0
     env.rewards.upper.upper_action_rate = -0.05
     env.rewards.upper.stay_close = 1.0
-    # Blows teach caution, and caution is slow.
     env.rewards.lower.track_mean_velocity = 6.0
     env.commands.stand_probability = 0.3
     # The base's spread is where exploration goes on from, not where it began.
