@@ -76,6 +76,17 @@ def test_worlds_that_fell_in_either_are_left_out_of_both():
     assert (row["difference"], row["pairs"], row["a"]) == (0.5, 2, 2.5)
 
 
+def test_shares_keep_their_width_and_one_world_has_none():
+    shares = [with_worlds([0.0] * 8) for _ in range(2)]
+    for r in shares:
+        r["metrics"]["x"] = summarize(torch.zeros(8, dtype=torch.bool))
+    low, high = compare(*shares)["differences"]["x"]["ci95"]
+    assert low < -0.2
+    assert high > 0.2
+    row = compare(with_worlds([1.0, None]), with_worlds([2.5, 1.0]))["differences"]["x"]
+    assert (row["difference"], row["reason"]) == (None, "fewer than two worlds have both")
+
+
 @pytest.mark.parametrize(
     ("worlds", "named"),
     [
@@ -84,6 +95,8 @@ def test_worlds_that_fell_in_either_are_left_out_of_both():
         ({"stood": [1.0], "x": 1.0}, "stood among them"),
         ({"stood": [1.0], "x": [1.0, 2.0]}, "worlds.x has 2 worlds"),
         ({"stood": [1.0], "x": ["1"]}, "finite numbers or null, got '1'"),
+        ({"stood": [None], "x": [1.0]}, "stood must be 0 or 1, got None"),
+        ({"stood": [0.5], "x": [1.0]}, "stood must be 0 or 1, got 0.5"),
     ],
 )
 def test_worlds_that_are_none_are_refused(tmp_path, capsys, worlds, named):

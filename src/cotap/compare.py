@@ -84,6 +84,8 @@ def _require_worlds(where: str, worlds: Any) -> None:
             raise ValueError(f"{where}.{name} has {len(values)} worlds, stood has {len(worlds['stood'])}")
         if wrong := [v for v in values if v is not None and not is_finite(v)]:
             raise ValueError(f"{where}.{name} must be finite numbers or null, got {wrong[0]!r:.80}")
+    if wrong := [v for v in worlds["stood"] if v not in (0, 1)]:
+        raise ValueError(f"{where}.stood must be 0 or 1, got {wrong[0]!r:.80}")
 
 
 def compare(a: dict[str, Any], b: dict[str, Any], without_falls: bool = False) -> dict[str, Any]:
@@ -113,13 +115,14 @@ def compare(a: dict[str, Any], b: dict[str, Any], without_falls: bool = False) -
 
 def measure_difference(a: dict[str, Any], b: dict[str, Any], name: str, without_falls: bool) -> dict[str, Any]:
     """`b - a` of one measure of two evaluations, world by world where both have them; as `difference`."""
-    worlds_a, worlds_b = a.get("worlds", {}), b.get("worlds", {})
+    old, new = (x.get("worlds", {}).get(name, []) for x in (a, b))
     seeds = [x["settings"].get("seed") for x in (a, b)]
-    paired = name in worlds_a and name in worlds_b and len(worlds_a[name]) == len(worlds_b[name])
-    if not paired or seeds[0] is None or seeds[0] != seeds[1]:
-        key = "metrics_without_falls" if without_falls else "metrics"
-        return difference(a[key][name], b[key][name])
-    return paired_difference(worlds_a, worlds_b, name, without_falls)
+    paired = old and len(old) == len(new) and seeds[0] is not None and seeds[0] == seeds[1]
+    # A bootstrap of shares has no width where all worlds agree; Newcombe's interval has.
+    if paired and not {*old, *new} <= {0.0, 1.0, None}:
+        return paired_difference(a["worlds"], b["worlds"], name, without_falls)
+    key = "metrics_without_falls" if without_falls else "metrics"
+    return difference(a[key][name], b[key][name])
 
 
 def paired_difference(a: dict[str, Any], b: dict[str, Any], name: str, without_falls: bool) -> dict[str, Any]:
@@ -140,8 +143,8 @@ def paired_difference(a: dict[str, Any], b: dict[str, Any], name: str, without_f
     if without_falls:
         both &= torch.tensor(a["stood"]).bool() & torch.tensor(b["stood"]).bool()
     summary = summarize((new - old)[both])
-    if summary["mean"] is None:
-        return {"a": None, "b": None, "difference": None, "ci95": None, "reason": "no world has it in both"}
+    if summary["n"] < 2:
+        return {"a": None, "b": None, "difference": None, "ci95": None, "reason": "fewer than two worlds have both"}
     means = {"a": float(old[both].mean()), "b": float(new[both].mean())}
     return means | {"difference": summary["mean"], "ci95": summary["ci95"], "pairs": summary["n"]}
 

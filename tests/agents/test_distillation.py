@@ -106,9 +106,15 @@ def test_the_base_is_never_changed_and_a_change_is_noticed():
     for key, value in learner.guide.model.state_dict().items():
         assert torch.equal(value, original[key]), key
     learner.guide.verify()
-    with torch.no_grad():
-        learner.guide.model.log_std["lower"][0] += 1e-3
-    with pytest.raises(RuntimeError, match="frozen base policy has changed"):
+    weight = next(p for p in learner.guide.model.parameters() if p.dim() == 2)
+    for changed in (-weight, weight.flip(0), weight + 1e-7):
+        kept = weight.detach().clone()
+        with torch.no_grad():
+            weight.copy_(changed)
+        with pytest.raises(RuntimeError, match="frozen base policy has changed"):
+            learner.guide.verify()
+        with torch.no_grad():
+            weight.copy_(kept)
         learner.guide.verify()
 
 

@@ -150,6 +150,18 @@ def test_another_number_of_worlds_goes_on_with_fresh_ones(tmp_path: Path, capsys
     assert content["iteration"] == 3
 
 
+@pytest.mark.parametrize(("collision", "fresh"), [("feet", False), ("full", True)])
+def test_worlds_of_another_model_start_afresh(tmp_path: Path, collision: str, fresh: bool, capsys: Any):
+    def configured(folder: Path, iterations: int, shapes: str) -> DualRunner:
+        runner = make_runner(folder, iterations)
+        runner.config = {"stage": "base", "training": {"env": {"collision": shapes}}}
+        return runner
+
+    configured(tmp_path / "a", 2, "feet").learn()
+    configured(tmp_path / "b", 3, collision).load(str(checkpoint(tmp_path / "a", 2)))
+    assert ("no simulator states" in "".join(capsys.readouterr())) == fresh
+
+
 @pytest.mark.parametrize("why", ["older", "another number", "not saved", "refitted"])
 def test_curricula_go_on_in_fresh_worlds(tmp_path: Path, why: str, capsys: pytest.CaptureFixture[str]):
     """The gantry's share, and the mean of what each world has come to."""

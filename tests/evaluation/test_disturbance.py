@@ -105,15 +105,15 @@ def test_displacement_is_what_the_load_adds():
 
 def test_a_load_overshoots_by_what_it_carries_the_hand_beyond_its_rest():
     """From 0.01 m to rest 0.1 m lower, at first 0.13 m: by 0.3; to the side, and after a fall, nothing counts."""
-    t = trajectory(steps=200, worlds=2)
+    t = trajectory(steps=200, worlds=3)
     t.hand_offset[:, :, 0, 2] = 0.01
-    t.hand_offset[50:, :, 0, 2] = -0.09
+    t.hand_offset[50:, :2, 0, 2] = -0.09
     t.hand_offset[60:65, :, 0, 2] = -0.12
     t.hand_offset[60:65, :, 0, 0] = 0.5
     t.fell[100, 1] = True
     over = load_overshoot(t, 50, 150, 200, LEFT)
     assert float(over[0]) == pytest.approx(0.3, abs=1e-5)
-    assert over[1].isnan()
+    assert over[1:].isnan().all()  # the last one's hand rests where it was
 
 
 def test_falls_are_told_apart_by_when():
@@ -241,9 +241,20 @@ def test_the_command_writes_what_was_asked_for(protocol, tmp_path, capsys):
     assert result["episode"]["metrics"]["j_upper"]["n"] == 16
     assert sum(result["falls"].values()) == result["num_falls"]
     assert (tmp_path / "plot.png").stat().st_size > 5000
+    assert result["metrics"]["j_upper_blow"]["n"] == 16
     assert ("load_overshoot" in result["metrics"]) == (protocol == "constant-load")
     assert "worlds" not in result
     assert "| e_ee_hit |" in capsys.readouterr().out
+
+
+def test_the_blow_itself_is_the_first_tenth_of_a_second():
+    protocol = Impact(num_envs=1)
+    t = trajectory(steps=150, worlds=1)
+    t.arm_torque[50:55, 0, 0] = 30.0
+    env = H1Env(protocol.configure(H1EnvConfig(num_threads=1)))
+    m = protocol.measure(t, env)["metrics"]
+    assert m["j_upper_blow"]["mean"] == pytest.approx(30.0)
+    assert m["j_upper"]["mean"] == pytest.approx(3.0)
 
 
 def test_every_worlds_figures_are_those_behind_the_means(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import hashlib
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -60,10 +61,13 @@ class Guide:
             if name not in self.cfg.agents:
                 cast(Head | SymmetricHead, actor).scale_output(self.cfg.free_start)
 
-    def fingerprint(self) -> float:
-        """A number that any change of the frozen policy changes."""
-        state = sorted(self.model.state_dict().items())
-        return float(sum((i + 1) * value.double().abs().sum() for i, (_, value) in enumerate(state)))
+    def fingerprint(self) -> str:
+        """SHA-256 of the frozen policy's bytes, tensor by tensor in the order of their names."""
+        digest = hashlib.sha256()
+        for name, value in sorted(self.model.state_dict().items()):
+            digest.update(name.encode())
+            digest.update(value.detach().cpu().numpy().tobytes())
+        return digest.hexdigest()
 
     def verify(self) -> None:
         """Raise RuntimeError if the frozen policy is no longer what it was."""

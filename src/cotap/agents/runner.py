@@ -36,6 +36,8 @@ from cotap.agents.run_log import RunLog, Unfailing, say
 from cotap.agents.runner_config import RunnerConfig
 
 CHECKPOINT_PATTERN = "checkpoint_*.pt"
+MODEL = ("collision", "unevenness_m", "fixed_base")
+"""Fields of an environment's config that make a model of other shapes or joints."""
 
 
 def layout_of(env: VecEnv, symmetric: bool = True) -> AgentLayout:
@@ -299,11 +301,11 @@ class DualRunner(OnPolicyRunner):
         return states[self.ranks.rank] if same_number else {"env": {}}
 
     def _are_ours(self, worlds: dict[str, Any], config: dict[str, Any]) -> bool:
-        """Whether these worlds of a run with that config are as many as ours, and models of the same shapes."""
+        """Whether these worlds of a run with that config are as many as ours, and of the same model."""
         if not worlds or worlds["episode_length"].shape[0] != self.env.num_envs:
             return False
-        theirs, own = (c.get("training", {}).get("env", {}).get("collision") for c in (config, self.config))
-        return theirs == own
+        theirs, own = (c.get("training", {}).get("env", {}) for c in (config, self.config))
+        return all(theirs.get(name) == own.get(name) for name in MODEL)
 
     def _own_state(self, worlds: bool = True) -> dict[str, Any]:
         """What is this rank's own."""

@@ -21,6 +21,10 @@ from cotap.evaluation.transient import back_within, transient_measures
 
 BEFORE_S = 0.5
 """What a hand does in this time before the onset is what it is compared with afterwards [s]."""
+BLOW_S = 0.1
+"""The time from the onset in which an arm takes a blow [s]."""
+LEAST_WAY_M = 0.005
+"""A load that moves the hand less than this has no overshoot that could be told from sway [m]."""
 
 
 @dataclass
@@ -83,10 +87,11 @@ class Impact(Scenario):
         window = window_measures(t, begin, end, hit)
         if any(self.force):
             window |= response_measures(t, onset, begin, end, hit)
+            window["j_upper_blow"] = window_measures(t, onset, onset + round(BLOW_S / t.dt), hit)["j_upper"]
         release = onset + round(self.duration / t.dt)
         if any(self.force) and release < end:
             window |= transient_measures(t, onset, release, end, hit, BEFORE_S)
-        elif any(self.force):
+        elif any(self.force) and self.place == "hand":
             window["load_overshoot"] = load_overshoot(t, onset, begin, end, hit)
         episode = window_measures(t, 0, len(t.fell), hit)
         return {
@@ -225,14 +230,15 @@ def load_overshoot(t: Trajectory, onset: int, begin: int, end: int, hit: list[in
     """How far beyond its rest a load first carries the hands in `hit`, over the way to that rest, (N,).
 
     Rest is the mean displacement from `begin` to before `end`; what counts is the displacement along it. NaN for a
-    world that fell before the window's end.
+    world that fell before the window's end, or whose hand rests within `LEAST_WAY_M` of where it was.
     """
     offset = t.hand_offset[:, :, hit].mean(2)
     moved = offset[onset:end] - offset[onset - round(BEFORE_S / t.dt) : onset].mean(0)
     rest = moved[begin - onset :].mean(0)
     way = rest.norm(dim=1).clamp_min(1e-9)
     furthest = (moved * (rest / way.unsqueeze(1))).sum(2).amax(0)
-    return torch.where(t.alive()[end - 1], furthest / way - 1.0, torch.full_like(way, math.nan))
+    measured = t.alive()[end - 1] & (way > LEAST_WAY_M)
+    return torch.where(measured, furthest / way - 1.0, torch.full_like(way, math.nan))
 
 
 def recovery(error: torch.Tensor, alive: torch.Tensor, onset: int, dt: float) -> tuple[torch.Tensor, torch.Tensor]:

@@ -17,7 +17,7 @@ UNITS = {
     "e_torso": "m/s", "e_torso_x": "m/s", "e_torso_y": "m/s", "e_ee_hit": "m", "peak_torque": "Nm",
     "energy": "J", "recovery_s": "s", "settle_s": "s", "transient_energy": "J/kg", "oscillation_energy": "J/kg",
     "displacement_x": "m", "displacement_y": "m", "displacement_z": "m",
-    "seconds_upright": "s",
+    "seconds_upright": "s", "j_upper_blow": "Nm",
 }  # fmt: skip
 
 
