@@ -22,6 +22,7 @@ class Book:
     reuse: bool
     lines: list[str] = field(default_factory=list)
     results: dict[str, dict[str, Any]] = field(default_factory=dict)
+    differences: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     def run(self, name: str, checkpoint: str, *args: str, envs: int | None = None) -> dict[str, Any] | None:
         """An evaluation's result under `name`; None where its checkpoint is not shipped."""
@@ -70,8 +71,8 @@ def fallen(result: dict[str, Any]) -> str:
     from cotap.evaluation.metrics import wilson_interval
 
     share, worlds = result["num_falls"] / result["num_envs"], result["num_envs"]
-    low, high = wilson_interval(share, worlds)
-    return f"{share:.2f} ({low:.2f} to {high:.2f})"
+    low, high = (100.0 * bound for bound in wilson_interval(share, worlds))
+    return f"{100.0 * share:.1f} % ({low:.1f} to {high:.1f})"
 
 
 def missing(checkpoint: str) -> str:
@@ -79,21 +80,30 @@ def missing(checkpoint: str) -> str:
     return f"checkpoint `{checkpoint}` is not shipped with this release: not measured"
 
 
-def ordering(book: Book, claim: str, smaller: str, larger: str, measure: str, digits: int = 3) -> None:
-    """Whether a measure is larger in one result than in another, in a line of the page."""
+def compared(book: Book, first: str, second: str, measure: str) -> dict[str, Any]:
+    """The second row less the first, over the worlds that stood in both; `difference` is null where there is none."""
     from cotap.compare import measure_difference
 
-    if smaller not in book.results or larger not in book.results:
-        book.add(f"- {claim}: not measured")
-        return
-    d = measure_difference(book.results[smaller], book.results[larger], measure, without_falls=True)
+    if not {first, second} <= book.results.keys():
+        return {"difference": None, "reason": "not measured"}
+    d = measure_difference(book.results[first], book.results[second], measure, without_falls=True)
+    book.differences[f"{measure}: {second} - {first}"] = d
+    return d
+
+
+def verdict(book: Book, smaller: str, larger: str, measure: str, digits: int = 3) -> str:
+    """Whether a measure is larger in one row than in another, as its interval has it."""
+    d = compared(book, smaller, larger, measure)
     if d["difference"] is None:
-        book.add(f"- {claim}: not measured ({d['reason']})")
-        return
+        return f"not measured ({d['reason']})"
     low, high = d["ci95"]
-    verdict = "holds" if low > 0.0 else "does not hold" if high < 0.0 else "cannot be told apart"
-    numbers = f"{d['difference']:+.{digits}f} ({low:+.{digits}f} to {high:+.{digits}f})"
-    book.add(f"- {claim}: **{verdict}**, difference {numbers}")
+    word = "holds" if low > 0.0 else "does not hold" if high < 0.0 else "cannot be told apart"
+    return f"**{word}**, difference {d['difference']:+.{digits}f} ({low:+.{digits}f} to {high:+.{digits}f})"
+
+
+def ordering(book: Book, claim: str, smaller: str, larger: str, measure: str, digits: int = 3) -> None:
+    """A claim and its verdict in a line of the page."""
+    book.add(f"- {claim}: {verdict(book, smaller, larger, measure, digits)}")
 
 
 def slug(text: str) -> str:
@@ -163,6 +173,7 @@ def write(folder: Path, book: Book) -> None:
         "method",
         "num_envs",
         "num_falls",
+        "falls",
         "seconds",
         "metrics",
         "metrics_without_falls",
@@ -183,5 +194,5 @@ def write(folder: Path, book: Book) -> None:
         | {"settings": {key: value for key, value in result["settings"].items() if key != "env"}}
         for name, result in book.results.items()
     }  # the environment is in the checkpoint
-    write_json(folder / "results.json", results)
+    write_json(folder / "results.json", {"rows": results, "differences": book.differences})
     print(f"\nwritten: {folder / 'results.md'}")

@@ -24,7 +24,7 @@ def book(tmp_path: Path) -> rp.Book:
 
 def measured(mean: float, half: float) -> dict:
     summary = {"mean": mean, "std": 1.0, "ci95": [mean - half, mean + half]}
-    measures = dict.fromkeys(("j_upper", "e_torso"), summary)
+    measures = dict.fromkeys(("j_upper", "j_upper_blow", "e_torso"), summary)
     return {"metrics_without_falls": measures, "settings": {"seed": 0}}
 
 
@@ -66,10 +66,10 @@ def test_an_error_without_bound_is_the_largest(book, monkeypatch):
     rows = [{"axis": "x", "error": -0.3, "n": 4}, {"axis": "y", "error": None, "n": 4},
             {"axis": "z", "error": None, "n": 0}]  # fmt: skip
     result = {"fidelity": rows, "num_wrong_way": 3, "coverage": 0.5, "num_falls": 1, "num_envs": 12,
-              "error_quantiles": {"50": 0.021, "95": 0.15}}  # fmt: skip
+              "num_unholdable": 2, "error_quantiles": {"50": 0.021, "95": 0.15}}  # fmt: skip
     monkeypatch.setattr(book, "run", lambda *_, **__: result)
     rp.fidelity(book, True)
-    assert "| cotap | joint | no bound | -30% / no bound / - | 2.1%, 15% | 3 | 50% | 1 of 12 |" in book.lines
+    assert "| cotap | joint | no bound | -30% / no bound / - | 2.1%, 15% | 3 | 2 | 50% | 1 of 12 |" in book.lines
 
 
 def test_the_papers_tables_have_seven_rows_each():
@@ -82,7 +82,7 @@ def test_page_and_json_are_written(book, tmp_path):
     book.results["x"] = measured(1.0, 0.1) | {"curve": [1] * 1000, "settings": {"seed": 7, "env": {"robot": "h1"}}}
     rp.write(tmp_path, book)
     assert (tmp_path / "results.md").read_text() == "# Title\n"
-    written = json.loads((tmp_path / "results.json").read_text())["x"]
+    written = json.loads((tmp_path / "results.json").read_text())["rows"]["x"]
     assert written.keys() == {"metrics_without_falls", "settings"}
     assert written["settings"] == {"seed": 7}
 
@@ -112,16 +112,19 @@ def test_only_evaluations_of_the_same_policy_and_settings_are_kept(book, monkeyp
         assert (not asked) == kept
 
 
-def test_differences_say_what_was_not_measured(book):
+def test_differences_say_what_was_measured_and_what_was_not(book):
     rp.differences(book)
     page = "\n".join(book.lines)
     assert "(not measured)" in page
     assert "of 51 kg by 0.49 m/s" in page
-    curve = {"time": [-0.02, 0.02, 0.1, 0.2, 0.5, 1.0], "arm_torque": [9.0, 4.0, 2.0, 6.0, 0.0, 8.0]}
-    book.results["impact-stance-cotap-K-100"] = measured(1.0, 0.1) | {"curve": curve}
-    book.results["impact-stance-cotap-PD-kp-100"] = measured(3.0, 0.1) | {"curve": curve}
+    assert "{" not in page
+    for row, mean in (("K-100", 1.0), ("PD-kp-100", 3.0)):
+        book.results[f"impact-stance-cotap-{row}"] = measured(mean, 0.1) | {"num_falls": 1, "num_envs": 8}
     rp.differences(book)
-    assert "| K 100 | 3.0 | 4.0 | 4.0 | 4.0 |" in book.lines
+    page = "\n".join(book.lines)
+    assert "less ours under PD: -2.000 (-2.141 to -1.859) m/s" in page
+    assert "Of ours 12.5 % (2.2 to 47.1) fall" in page
+    assert book.differences["e_torso: impact-stance-cotap-K-100 - impact-stance-cotap-PD-kp-100"]["difference"] == -2.0
 
 
 @pytest.mark.slow
