@@ -339,10 +339,15 @@ def fidelity(book: Book, quick: bool) -> None:
             worst = [worst_error([r for r in result["fidelity"] if r["axis"] == axis]) for axis in "xyz"]
             book.add(
                 f"| {label} | {error} | {largest_error(result['fidelity'])} | {' / '.join(worst)} "
-                f"| {single['50']:.1%}, {single['95']:.0%} "
+                f"| {share(single['50'], 1)}, {share(single['95'])} "
                 f"| {result['num_wrong_way']} | {result['num_unholdable']} | {result['coverage']:.0%} "
                 f"| {result['num_falls']} of {result['num_envs']} |"
             )
+
+
+def share(value: float | None, digits: int = 0) -> str:
+    """A share in percent; among hands some of which went the wrong way it may have no bound."""
+    return "no bound" if value is None else f"{value:.{digits}%}"
 
 
 def largest_error(rows: list[dict[str, Any]]) -> str:

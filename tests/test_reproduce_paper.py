@@ -70,6 +70,9 @@ def test_an_error_without_bound_is_the_largest(book, monkeypatch):
     monkeypatch.setattr(book, "run", lambda *_, **__: result)
     rp.fidelity(book, True)
     assert "| cotap | joint | no bound | -30% / no bound / - | 2.1%, 15% | 3 | 2 | 50% | 1 of 12 |" in book.lines
+    result["error_quantiles"]["95"] = None
+    rp.fidelity(book, True)
+    assert "| cotap | joint | no bound | -30% / no bound / - | 2.1%, no bound | 3 | 2 | 50% | 1 of 12 |" in book.lines
 
 
 def test_the_papers_tables_have_seven_rows_each():
