@@ -534,7 +534,8 @@ def singular(book: Book) -> None:
             continue
         at_rest, after = (r["metrics_without_falls"] for r in (rest, blow))
         book.add(
-            f"| {label} | {number(at_rest['e_upper'])} | {number(after['e_upper'])} | {number(after['e_ee_hit'])} |"
+            f"| {label} | {number(at_rest['e_upper'])} | {number(after['e_upper'])} | {number(after['e_ee_hit'])} "
+            f"| {fallen(blow)} |"
         )
     book.add("")
     for when, row in (("at rest", "singular-rest"), ("after the blow", "singular")):
