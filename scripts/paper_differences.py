@@ -31,8 +31,9 @@ BLENDS = """From K 100 over alpha 0.7 and 0.3 to PD the paper's J_upper rises by
 blend changes is the answer to the blow itself; over a second the three blends, which carry the arms' weight and damp
 critically alike, differ by next to nothing, and PD, which does neither, stands apart."""
 
-FALLS = """The paper gives no share of falls. Of ours {fell} fall in stance at K 100 when the blow finds the arms moving; at the
-arms' default pose none of the standing ones does from this blow ([distillation](distillation.md#against-pd))."""
+FALLS = """The paper gives no share of falls. Of ours {fell} fall in stance at K 100 when the blow finds the arms
+moving; at the arms' default pose none of the standing ones does from this blow
+([distillation](distillation.md#against-pd))."""
 
 LOADS = """Under PD the paper's hand error reverses after its peak (-0.03 m). A hand at rest lies on the load's side
 ({pd} m here), so that is motion, or the policy's own arm actions, which the paper names and which ours learns to leave
