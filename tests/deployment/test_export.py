@@ -30,17 +30,14 @@ from cotap.export import main as export
 
 
 @pytest.mark.parametrize(("apart_m", "clear_m"), [(0.0, 0.0), (0.04, 0.4)])
-def test_targets_are_the_environments_while_walking_standing_and_crouching(
-    apart_m, clear_m, policy, make_env, tmp_path
-):
+def test_targets_are_the_environments_while_walking_standing_and_crouching(apart_m, clear_m, make_env, tmp_path):
     """The graph must contain all that the environment feeds forward; the arms' advance is added outside."""
-    if clear_m:
-        content = load_checkpoint(shipped_checkpoint("base"))
-        widths = {"step_apart_m": apart_m, "step_clear_m": clear_m}
-        content["config"]["training"]["env"]["commands"].update(widths)
-        save_checkpoint(tmp_path / "apart.pt", content)
-        export_policy(tmp_path / "apart.pt", tmp_path / "apart.onnx", checks=20)
-        policy = OnnxPolicy(tmp_path / "apart.onnx")
+    content = load_checkpoint(shipped_checkpoint("base"))
+    widths = {"step_apart_m": apart_m, "step_clear_m": clear_m}
+    content["config"]["training"]["env"]["commands"].update(widths)
+    save_checkpoint(tmp_path / "apart.pt", content)
+    export_policy(tmp_path / "apart.pt", tmp_path / "apart.onnx", checks=20)
+    policy = OnnxPolicy(tmp_path / "apart.onnx")
     env = make_env(6, collision="feet", commands=CommandConfig(step_apart_m=apart_m, step_clear_m=clear_m))
     env.cfg.hand_forces.enabled = False
     env.commands.override(

@@ -34,6 +34,7 @@ def batched(
     policy = load_policy(shipped_checkpoint("base"))
     cfg = policy.env_config
     cfg.num_envs, cfg.num_threads, cfg.fixed_base, cfg.upper_body = 1, 1, True, laws
+    cfg.collision = "feet"  # as the engine below: rounding grows where legs touch
     cfg.assist.enabled = cfg.hand_forces.enabled = cfg.blows.enabled = cfg.randomization.enabled = False
     cfg.motions.clips.only, cfg.motions.clips.share = ("punch",), 1.0
     cfg.force.force, cfg.force.hand, cfg.force.start_s = (8.0, -5.0, -6.0), "both", 0.5

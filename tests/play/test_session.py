@@ -96,7 +96,7 @@ def test_a_checkpoint_that_cannot_be_used_is_put_back_and_told(session):
 
 def test_a_fallen_robot_is_back_on_its_feet_and_counted(session):
     falls = list(session.falls)
-    session.env.sim.qpos[1, 2] = 0.3
+    session.env.sim.qpos[1, 2:7] = torch.tensor([0.6, 0.5**0.5, 0.0, 0.5**0.5, 0.0])  # on its face
     sample = session.step()
     assert sample["fell"].tolist() == [False, True]
     assert [b - a for a, b in zip(falls, session.falls, strict=True)] == [0, 1]
