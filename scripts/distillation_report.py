@@ -5,11 +5,12 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from kept_evaluations import kept_or_run
 
 STIFFNESS = (100, 300, 500, 800)
 ALPHA = (0.0, 0.3, 0.7, 1.0)
@@ -28,25 +29,14 @@ class Runs:
 
     folder: Path
     checkpoint: str
+    base: str
     threads: int
     reuse: bool
 
     def __call__(self, name: str, *args: str, checkpoint: str = "") -> dict[str, Any]:
-        """The result of an evaluation; one of the same policy and options that is there already, where allowed."""
-        from cotap.agents.checkpoint import sha256, write_json
-        from cotap.evaluate import evaluate
-        from cotap.evaluation.policy import find_checkpoint
-
-        path, checkpoint = self.folder / f"{name}.json", checkpoint or self.checkpoint
-        asked = [args[0], "--checkpoint", checkpoint, *args[1:]]
-        kept = json.loads(path.read_text()) if self.reuse and path.is_file() else {}
-        if kept.get("arguments") != asked or kept["settings"]["checkpoint_sha256"] != sha256(
-            find_checkpoint(checkpoint)
-        ):
-            print(f"\n{name}", flush=True)
-            kept = evaluate([*asked, "--threads", str(self.threads)]) | {"arguments": asked}
-            write_json(path, kept)
-        return kept
+        """The result of an evaluation of the distilled policy, or of another."""
+        path = self.folder / f"{name}.json"
+        return kept_or_run(path, list(args), checkpoint or self.checkpoint, self.threads, self.reuse)
 
 
 def number(m: dict[str, Any], digits: int = 3) -> str:
@@ -64,8 +54,8 @@ def no_worse(mine: dict[str, Any], base: dict[str, Any]) -> bool:
 def walking(runs: Runs, envs: int, seconds: float) -> list[str]:
     """The walk under every stiffness and blend, beside the base's in the same simulation and in an easier one."""
     task = ["velocity-tracking", "--num-envs", str(envs), "--episode-seconds", str(seconds)]
-    base = runs("walking-base", *task, "--collision", "full", checkpoint="base")
-    easier = runs("walking-base-feet", *task, "--collision", "feet", checkpoint="base")
+    base = runs("walking-base", *task, "--collision", "full", checkpoint=runs.base)
+    easier = runs("walking-base-feet", *task, "--collision", "feet", checkpoint=runs.base)
     lines = [
         "## Walking", "",
         f"Random commands, clips on the arms, randomisation on, {envs} worlds, {seconds:g} s, legs, arms and torso "
@@ -192,7 +182,8 @@ def changing(runs: Runs, envs: int) -> list[str]:
 def main() -> int:
     """Measure and write. Exit status."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--checkpoint", default="cotap", help="the distilled policy; the base is the shipped one")
+    parser.add_argument("--checkpoint", default="cotap", help="the distilled policy")
+    parser.add_argument("--base", default="base", help="the base that it is compared with")
     parser.add_argument("--num-envs", type=int, default=1024)
     parser.add_argument("--obedience-envs", type=int, default=4096)
     parser.add_argument("--walking-envs", type=int, default=512)
@@ -203,13 +194,13 @@ def main() -> int:
     parser.add_argument("--output", type=Path, default=Path("docs/distillation.md"))
     options = parser.parse_args()
     options.evaluations.mkdir(parents=True, exist_ok=True)
-    runs = Runs(options.evaluations, options.checkpoint, options.threads, options.reuse)
+    runs = Runs(options.evaluations, options.checkpoint, options.base, options.threads, options.reuse)
     from cotap.files import write_atomically
 
     lines = [
         "# What distillation did",
         "",
-        f"Written by `scripts/distillation_report.py`; policy `{options.checkpoint}`.",
+        f"Written by `scripts/distillation_report.py`; policy `{options.checkpoint}`, base `{options.base}`.",
         "",
     ]
     lines += walking(runs, options.walking_envs, options.walking_seconds)

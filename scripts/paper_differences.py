@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-from paper_page import Book, compared, fallen
+from paper_page import Book, compared, fallen, slug
 from paper_tables import IMPACT, ROWS
 
 IMPULSE_NS = 25.0
@@ -129,8 +129,6 @@ def torso(book: Book) -> dict[str, str | float]:
 
 def torque(book: Book) -> dict[str, str]:
     """J_upper of the blow itself beside the paper's, row by row."""
-    from paper_page import slug
-
     pairs = zip(ROWS, IMPACT["stance"], strict=True)
     early = ", ".join(
         f"{row} {of(book, f'impact-stance-cotap-{slug(row)}', 'j_upper_blow', 1)} Nm ({paper[2]:.1f})"

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+from kept_evaluations import kept_or_run
 
 PAIRED = ("impact", "constant-load")
 """Protocols that write every world's figures, so that two evaluations are compared world by world."""
@@ -26,25 +27,16 @@ class Book:
 
     def run(self, name: str, checkpoint: str, *args: str, envs: int | None = None) -> dict[str, Any] | None:
         """An evaluation's result under `name`; None where its checkpoint is not shipped."""
-        from cotap.evaluate import evaluate
         from cotap.evaluation.policy import shipped_names
 
         if checkpoint not in shipped_names():
             return None
-        from cotap.agents.checkpoint import sha256, write_json
-        from cotap.evaluation.policy import checkpoint_path
-
+        size = [] if envs == 0 else ["--num-envs", str(envs or self.envs)]
+        paired = ["--worlds"] if args[0] in PAIRED else []
         path = self.evaluations / f"{name}.json"
-        worlds = [] if envs == 0 else ["--num-envs", str(envs or self.envs)]
-        asked = [args[0], *worlds, "--checkpoint", checkpoint, *(["--worlds"] if args[0] in PAIRED else []), *args[1:]]
-        sha = sha256(checkpoint_path(checkpoint))
-        kept = json.loads(path.read_text()) if self.reuse and path.is_file() else {}
-        if kept.get("arguments") != asked or kept["settings"]["checkpoint_sha256"] != sha:
-            print(f"\n{name}")
-            kept = evaluate([*asked, "--threads", str(self.threads)]) | {"arguments": asked}
-            write_json(path, kept)
-        self.results[name] = kept
-        return kept
+        arguments = [args[0], *size, *paired, *args[1:]]
+        self.results[name] = kept_or_run(path, arguments, checkpoint, self.threads, self.reuse)
+        return self.results[name]
 
     def add(self, *lines: str) -> None:
         """Add lines to the page."""

@@ -92,13 +92,11 @@ class ScenarioOptions(CommonOptions):
 class ImpactOptions(ScenarioOptions):
     """A blow on a hand: errors of hand, arm and torso, torques, recovery, falls."""
 
-    worlds: bool = False
-    """Write every world's figures as well: `python -m cotap.compare` then compares world by world."""
     protocol: tyro.conf.OmitArgPrefixes[Impact] = field(default_factory=Impact)
 
 
 @dataclass
-class ConstantLoadOptions(ImpactOptions):
+class ConstantLoadOptions(ScenarioOptions):
     """A load on a hand, held: errors of hand, arm and torso, torques, effective stiffness, falls."""
 
     protocol: tyro.conf.OmitArgPrefixes[ConstantLoad] = field(default_factory=ConstantLoad)
@@ -379,8 +377,6 @@ def scenario(name: str, options: ScenarioOptions) -> dict[str, Any]:
         arm_actions=protocol.arm_actions, before_step=protocol.before_step, film=bool(options.video),
     )  # fmt: skip
     measured = protocol.measure(trajectory, env)
-    if not getattr(options, "worlds", False):
-        measured.pop("worlds", None)
     result = _result(name, options, protocol, env, checkpoint) | {
         "num_falls": int(trajectory.fell.any(0).sum()),
         "seconds": time.perf_counter() - start,

@@ -76,8 +76,8 @@ class DistillOptions:
 
 @dataclass
 class PipelineOptions:
-    """Both stages: a base policy that walks, then takes blows and loads, then its distillation; under three hours on
-    two cores. For more options: `python -m cotap.train base --help`, `python -m cotap.train distill --help`."""
+    """Both stages: a base policy that walks, then takes blows and loads, then its distillation. For more options:
+    `python -m cotap.train base --help`, `python -m cotap.train distill --help`."""
 
     run_dir: str = ""
     """Where the runs go, into folders `base`, `robust` and `distill`; by default runs/cotap-DATE-TIME."""

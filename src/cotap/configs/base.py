@@ -62,9 +62,7 @@ def robust(training: BaseTraining | None = None) -> BaseTraining:
     on its hands, to step where standing does not do any more, and to keep its legs out of each other's way."""
     training = copy.deepcopy(training) if training else default()
     env = training.env
-    # Legs that may pass through each other learn to, and trip over each other anywhere else.
-    env.collision = "full"
-    env.commands.step_apart_m, env.commands.step_clear_m = 0.04, 0.15
+    let_legs_collide(env)
     env.commands.steady_rad = STEADY_RAD
     env.commands.step_timing = True
     env.commands.stand_probability = 0.3
@@ -80,6 +78,12 @@ def robust(training: BaseTraining | None = None) -> BaseTraining:
     training.ppo.desired_kl = 0.01
     training.runner.iterations = 2085
     return training
+
+
+def let_legs_collide(env: H1EnvConfig) -> None:
+    """All shapes meet, and feet keep apart: legs that may pass through each other learn to, and trip anywhere else."""
+    env.collision = "full"
+    env.commands.step_apart_m, env.commands.step_clear_m = 0.04, 0.15
 
 
 def facet() -> BaseTraining:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from cotap.agents.distillation import DistillationConfig
-from cotap.configs.base import BaseTraining, reward_as_facet
+from cotap.configs.base import BaseTraining, let_legs_collide, reward_as_facet
 
 
 @dataclass
@@ -30,8 +30,7 @@ def default(base: BaseTraining) -> DistillTraining:
     env = training.env
     env.assist.enabled = False
     env.commands.step_timing = True
-    env.collision = "full"
-    env.commands.step_apart_m, env.commands.step_clear_m = 0.04, 0.15
+    let_legs_collide(env)
     for law in (env.upper_body.left, env.upper_body.right):
         law.name, law.damping = "cotap", "critical"
     env.upper_body.sampling.enabled = True

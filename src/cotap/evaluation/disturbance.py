@@ -47,6 +47,8 @@ class Impact(Scenario):
     """What is measured, from the onset [s]."""
     episode_seconds: float = 3.0
     """Length of the evaluation [s]."""
+    worlds: bool = False
+    """Write every world's figures as well: `python -m cotap.compare` then compares world by world."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
@@ -105,7 +107,7 @@ class Impact(Scenario):
                 "window": {"start": 0.0, "end": self.seconds},
             },
             "curve": curve(t, onset, hit),
-            "worlds": per_world(window, stood),
+            **({"worlds": per_world(window, stood)} if self.worlds else {}),
         } | self._stiffness(env, window, stood)
 
     def _stiffness(self, env: H1Env, measures: dict[str, torch.Tensor], stood: torch.Tensor) -> dict[str, Any]:
