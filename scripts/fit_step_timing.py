@@ -19,7 +19,7 @@ from cotap.envs import H1Env, step_timing
 from cotap.envs.commands import STEADY_RAD, Catch, Command
 from cotap.envs.state import RobotState
 from cotap.envs.step_timing import BINS, FallRisk, feature_reflection, features, risk_at
-from cotap.evaluation.policy import load_policy
+from cotap.evaluation.policy import find_checkpoint, load_policy
 from cotap.files import write_atomically
 from cotap.robots import ROBOTS
 
@@ -83,7 +83,7 @@ class RandomCatch:
 def collect(options: argparse.Namespace) -> int:
     """Run trials and write them."""
     torch.set_num_threads(options.threads)
-    policy = load_policy(options.checkpoint)
+    policy = load_policy(find_checkpoint(options.checkpoint))
     cfg = policy.env_config
     cfg.num_envs, cfg.seed, cfg.num_threads = options.num_envs, options.seed, options.threads
     cfg.assist.enabled = cfg.commands.step_timing = False
