@@ -45,7 +45,7 @@ from cotap.compliance.laws import LAWS, LawConfig
 from cotap.configs import BASE_RECIPES, BaseTraining
 from cotap.envs import H1Env, H1EnvConfig
 from cotap.envs.reference import ReferenceConfig, ReferenceMotion
-from cotap.evaluation.policy import load_policy, shipped_checkpoint
+from cotap.evaluation.policy import find_checkpoint, load_policy
 from cotap.motions import MotionClip, MotionLibrary
 from cotap.robots import RobotSpec, h1
 from cotap.robots.chains import arm_model
@@ -83,11 +83,6 @@ def full_env(num_envs: int) -> H1Env:
     env = H1Env(cfg)
     env.episode_length_buf = torch.randint_like(env.episode_length_buf, high=env.max_episode_length)
     return env
-
-
-def scripted(observations: dict[str, torch.Tensor]) -> torch.Tensor:
-    """No action: default legs stepping to the gait clock. Stands in where there is no checkpoint."""
-    return torch.zeros(observations["policy"].shape[0], len(h1().joints))
 
 
 def record(env: H1Env, policy: Actor, warm_up: int, steps: int) -> Recording:
@@ -391,9 +386,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     """Everything that goes into the JSON."""
     torch.manual_seed(0)
     num_envs, seconds, repeats = options.num_envs, options.seconds, options.repeats
-    checkpoint: Path = options.checkpoint or shipped_checkpoint("base")
-    is_trained = bool(options.checkpoint) or checkpoint.exists()
-    policy: Actor = load_policy(checkpoint) if is_trained else scripted
+    policy: Actor = load_policy(find_checkpoint(options.checkpoint))
     memory = peak_memory_mib(num_envs)  # before this process grows, whose size a child's peak begins with
     env = full_env(num_envs)
     recording = record(env, policy, WARM_UP_STEPS, options.steps)
@@ -422,7 +415,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     by_size = rates_by_size(options.sizes, policy, seconds, repeats)
     return {
         "num_envs": num_envs,
-        "policy": checkpoint.name if is_trained else "scripted: no checkpoint is shipped",
+        "policy": options.checkpoint,
         "physics_steps_per_s": median["physics"],
         "env_steps_per_s": median["env"],
         "train_steps_per_s": median.get("train"),
@@ -496,7 +489,7 @@ def main() -> int:
     parser.add_argument("--steps", type=int, default=20, help="control steps recorded for the physics reference")
     parser.add_argument("--sizes", type=sizes, default=[512, 1024, 2048, 4096, 8192], help="comma-separated")
     parser.add_argument("--networks", nargs="+", choices=("default", "paper"), default=["default", "paper"])
-    parser.add_argument("--checkpoint", type=Path, help="policy to record and drive with; by default the shipped base")
+    parser.add_argument("--checkpoint", default="base", help="policy to record and drive with, a file or a shipped one")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--quick", action="store_true", help="small and short: shows that it runs, measures little")
     options = parser.parse_args()

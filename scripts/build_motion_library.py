@@ -1,13 +1,12 @@
 """Make the motion library that the package ships, from the DeepMimic clips in the `pybullet` package's data.
 
-    python -m pip install pybullet
-    python scripts/build_motion_library.py [FOLDER]
-
-FOLDER is `pybullet_data/data/motions`; without it, that of the installed package.
+python -m pip install pybullet
+python scripts/build_motion_library.py [FOLDER]
 """
 
 from __future__ import annotations
 
+import argparse
 import sys
 from dataclasses import replace
 from importlib.util import find_spec
@@ -15,7 +14,7 @@ from pathlib import Path
 
 import cotap
 from cotap.motions.importer import ImportResult, import_motions, table
-from cotap.motions.library import MotionClip, MotionLibrary
+from cotap.motions.library import MotionClip, MotionError, MotionLibrary
 from cotap.motions.processing import mirror_clip
 from cotap.robots import h1
 
@@ -38,9 +37,14 @@ def short_name(name: str) -> str:
 
 def main() -> int:
     """Import, mirror, name, save, and print the table of quality."""
-    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else installed_folder()
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", nargs="?", type=Path, help="pybullet_data/data/motions; by default the installed one")
+    options = parser.parse_args()
     spec = h1()
-    result = import_motions([folder], spec, "deepmimic")
+    try:
+        result = import_motions([options.folder or installed_folder()], spec, "deepmimic")
+    except MotionError as error:
+        parser.error(str(error))
     named = [
         replace(c, name=short_name(c.name), source=SOURCE.format(file=f"{c.name}.txt"), licence=LICENCE)
         for c in result.clips

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import shutil
@@ -9,6 +10,7 @@ import sys
 from pathlib import Path
 
 OUT = Path("runs/demo")
+ITERATIONS = 6
 IMPACT = ["impact", "--num-envs", "256", "--force", "500", "0", "0"]
 METHODS = {"pd": ["--method", "pd"], "cotap": ["--method", "cotap", "--stiffness", "200", "--alpha", "0.5"]}
 MEASURES = {
@@ -19,8 +21,9 @@ MEASURES = {
 }
 
 
-def main() -> int:
+def main(argv: list[str] | None = None) -> int:
     """Distil for a few iterations from the shipped policies, then evaluate the shipped CoTaP policy. Exit status."""
+    argparse.ArgumentParser(description=__doc__).parse_args(argv)
     if sys.platform == "linux":
         os.environ.setdefault("MUJOCO_GL", "osmesa" if not Path("/dev/dri").exists() else "egl")
     from cotap.evaluate import main as evaluate
@@ -32,9 +35,12 @@ def main() -> int:
     print("1. Distillation under compliance goes on from the shipped CoTaP policy for a few iterations")
     cotap = shipped_checkpoint("cotap")
     # A shipped checkpoint has no optimiser to go on with, so that its run counts from nothing.
-    resumed = ["distill", "--resume", str(cotap), "--run-dir", str(OUT / "training"), "--iterations", "6"]
+    training = OUT / "training"
+    resumed = ["distill", "--resume", str(cotap), "--run-dir", str(training), "--iterations", str(ITERATIONS)]
     if status := train([*resumed, "--num-envs", "1024", "--threads", "0"]):
         return status
+    if not (training / f"checkpoint_{ITERATIONS:06d}.pt").is_file():
+        return 130  # it was asked to stop
     print("2. A blow of 500 N for 50 ms on the left hand, 256 worlds, under PD and under CoTaP (200 N/m, alpha 0.5)")
     for name, options in METHODS.items():
         files = ["--json", str(OUT / f"impact_{name}.json"), "--plot", str(OUT / f"impact_{name}.png")]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import argparse
 import sys
+from pathlib import Path
 
 import torch
 
@@ -18,13 +20,15 @@ def ellipse(stiffness: torch.Tensor, points: int = 121) -> torch.Tensor:
 
 
 def main() -> int:
-    """Draw and write the file named on the command line (default docs/blend.png)."""
+    """Draw and write. Exit status."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("output", nargs="?", type=Path, default=Path("docs/blend.png"))
+    path = parser.parse_args().output
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    path = sys.argv[1] if len(sys.argv) > 1 else "docs/blend.png"
     turn = torch.tensor([[0.8, -0.6], [0.6, 0.8]], dtype=torch.float64)
     compliant = turn @ torch.diag(torch.tensor([1.0, 0.1], dtype=torch.float64)) @ turn.T
     pd = turn.T @ torch.diag(torch.tensor([1.0, 0.1], dtype=torch.float64)) @ turn

@@ -23,12 +23,25 @@ def test_it_ends_with_the_command_that_the_readme_has_for_the_page(monkeypatch, 
             )
         return 0 if filmed or "--video" not in arguments else 2
 
+    def train(_arguments):
+        (demo.OUT / "training").mkdir()
+        (demo.OUT / "training" / f"checkpoint_{demo.ITERATIONS:06d}.pt").touch()
+        return 0
+
     monkeypatch.setenv("MUJOCO_GL", "osmesa")  # else the demo would set it for all tests that follow
     monkeypatch.setattr("cotap.evaluate.main", evaluate)
-    monkeypatch.setattr("cotap.train.main", lambda _: 0)
-    assert demo.main() == 0
+    monkeypatch.setattr("cotap.train.main", train)
+    assert demo.main([]) == 0
     out = capsys.readouterr().out
     assert "| worlds that fell | 0.500 (0.400 to 0.600) | 0.500 (0.400 to 0.600) |" in out
     command = ".venv/bin/python -m cotap.play"
     assert command in out.splitlines()[-1]
     assert f"`{command}`" in (Path(__file__).parents[1] / "README.md").read_text()
+
+
+@pytest.mark.usefixtures("in_tmp_path")
+def test_it_ends_where_its_training_is_stopped(monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "osmesa")
+    monkeypatch.setattr("cotap.train.main", lambda _: 0)  # a training that is asked to stop ends in order
+    monkeypatch.setattr("cotap.evaluate.main", None)
+    assert demo.main([]) == 130

@@ -19,6 +19,7 @@ from cotap.agents.checkpoint import load_checkpoint, save_checkpoint
 from cotap.configs import BASE_RECIPES, CONTINUATIONS, BaseTraining, from_plain
 from cotap.envs import H1Env
 from cotap.envs.rewards import LowerRewards, UpperRewards
+from cotap.evaluation.policy import shipped_checkpoint
 
 # Every option that these tests use, as typed on the command line.
 ENVS = "--num-envs"
@@ -484,7 +485,8 @@ def test_distilling_from_a_distilled_policy_is_refused(
     assert tree(tmp_path) == before
 
 
-def test_without_a_stage_both_run_and_are_summed_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any):
+def tiny_networks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the pipeline begin with small networks and short rollouts."""
     parse = train._parse_base
 
     def tiny(args: list[str]) -> train.BaseOptions:
@@ -493,9 +495,72 @@ def test_without_a_stage_both_run_and_are_summed_up(tmp_path: Path, monkeypatch:
         return options
 
     monkeypatch.setattr(train, "_parse_base", tiny)
+
+
+BOTH = [ENVS, 8, THREADS, 1, "--base-iterations", 2, "--robust-iterations", 1, "--distill-iterations", 1]
+
+
+def test_stopped_in_a_stage_the_pipeline_ends_there_and_goes_on_from_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+):
+    """The second stage must not begin from half a first one."""
+    tiny_networks(monkeypatch)
+    step, calls, out = H1Env.step, [], tmp_path / "both"
+
+    def interrupted(self: H1Env, actions: torch.Tensor) -> Any:
+        calls.append(1)
+        if len(calls) == 3:
+            signal.raise_signal(signal.SIGINT)
+        return step(self, actions)
+
+    monkeypatch.setattr(H1Env, "step", interrupted)
+    assert run(*BOTH, RUN_DIR, out) == 130
+    said = capsys.readouterr().err
+    assert f"stopped at iteration 1 of 2 of {out / 'base'}" in said
+    assert f"--run-dir {out} --resume" in said
+    assert [p.name for p in out.iterdir()] == ["base"]
+    assert run(*BOTH, RUN_DIR, out, RESUME) == 0
+    assert "| distill | 1 | 48 |" in capsys.readouterr().out
+    assert newest(out / "base")["iteration"] == 2
+    kept = (out / "distill" / "checkpoint_000001.pt").read_bytes()
+    assert run(*BOTH, RUN_DIR, out, RESUME) == 0  # there is nothing left to do
+    assert (out / "distill" / "checkpoint_000001.pt").read_bytes() == kept
+
+
+def test_going_on_with_the_pipeline_needs_to_know_where(capsys: pytest.CaptureFixture[str]):
+    assert run(*BOTH, RESUME) == 2
+    assert "--run-dir" in capsys.readouterr().err
+
+
+def test_shipped_checkpoints_go_by_their_names_and_their_folder_is_left_alone(monkeypatch: pytest.MonkeyPatch):
+    options = captured(monkeypatch, "base", RESUME, "base")
+    assert Path(options.resume) == shipped_checkpoint("base")
+    assert Path(train._expand([BASE_CHECKPOINT, "base"])[-1].partition("=")[2]) == shipped_checkpoint("base")
+
+
+def test_going_on_from_a_checkpoint_of_no_run_begins_a_run_of_its_own(
+    checkpoint: Path, tmp_path: Path, monkeypatch: Any
+):
+    shipped = checkpoint.rename(checkpoint.with_name("mine.pt"))
+    before = tree(shipped.parent)
+    monkeypatch.chdir(tmp_path)
+    assert run("base", RESUME, shipped, ITERATIONS, 3) == 0
+    assert tree(shipped.parent) == before
+    (folder,) = (tmp_path / "runs").iterdir()
+    assert newest(folder)["iteration"] == 3
+
+
+def test_a_base_that_would_be_ignored_is_refused(checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    distill(tmp_path / "run", checkpoint)
+    resumed = max((tmp_path / "run").glob("checkpoint_*.pt"))
+    assert run("distill", RESUME, resumed, BASE_CHECKPOINT, checkpoint, ITERATIONS, 3) == 2
+    assert "brings the base that guides it" in capsys.readouterr().err
+
+
+def test_without_a_stage_both_run_and_are_summed_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any):
+    tiny_networks(monkeypatch)
     out = tmp_path / "both"
-    counts = ["--base-iterations", 2, "--robust-iterations", 1, "--distill-iterations", 1]
-    assert run(ENVS, 8, THREADS, 1, *counts, RUN_DIR, out) == 0
+    assert run(*BOTH, RUN_DIR, out) == 0
     assert newest(out / "base")["kind"] == newest(out / "robust")["kind"] == "base"
     assert not newest(out / "base")["config"]["training"]["env"]["blows"]["enabled"]
     assert newest(out / "robust")["config"]["training"]["env"]["blows"]["enabled"]

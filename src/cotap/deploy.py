@@ -17,6 +17,7 @@ from cotap.deployment.robot import Perturbations
 from cotap.deployment.safety import SafetyConfig
 from cotap.deployment.scenario import Scenario, TimedCommand, load_scenario
 from cotap.evaluation.law_options import parse_law
+from cotap.files import require_output
 
 
 @dataclass
@@ -78,10 +79,8 @@ def deploy(options: DeployOptions) -> dict[str, Any]:
     require_seed("seed", options.seed)
     for part in (options.engine, options.perturbations, options.safety):
         part.check()
-    for name in ("json", "video"):
-        path = getattr(options, name)
-        if path and not Path(path).resolve().parent.is_dir():
-            raise ValueError(f"--{name} {path!r}: its folder does not exist")
+    require_output("--json", options.json)
+    require_output("--video", options.video, (".mp4",))
     if options.keyboard and (options.scenario or options.trials > 1):
         raise ValueError("--keyboard goes with neither --scenario nor --trials")
     policy = OnnxPolicy(options.policy)

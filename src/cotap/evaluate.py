@@ -28,6 +28,7 @@ from cotap.evaluation.recording import RecordingProtocol
 from cotap.evaluation.scenario import Scenario
 from cotap.evaluation.stability import Stability
 from cotap.evaluation.static import StaticStiffness
+from cotap.files import require_output
 
 if TYPE_CHECKING:
     import numpy as np
@@ -60,7 +61,7 @@ class VelocityTrackingOptions(CommonOptions):
     """Commanded against measured velocity: errors, slopes, falls, gait quality."""
 
     video: str = ""
-    """Write a video of one robot on a tour of commands here (MP4); a contact sheet (PNG) goes beside it."""
+    """Write a video of one robot on a tour of commands here (MP4); a contact sheet (NAME_frames.png) goes beside it."""
     protocol: tyro.conf.OmitArgPrefixes[VelocityTracking] = field(default_factory=VelocityTracking)
 
 
@@ -84,7 +85,7 @@ class ScenarioOptions(CommonOptions):
     """What protocols take that disturb a robot that stands or walks."""
 
     video: str = ""
-    """Write a video of the first world here (MP4); a contact sheet (PNG) goes beside it."""
+    """Write a video of the first world here (MP4); a contact sheet (NAME_frames.png) goes beside it."""
     protocol: tyro.conf.OmitArgPrefixes[Scenario] = field(kw_only=True)
 
 
@@ -192,8 +193,7 @@ def _prepare(options: CommonOptions, protocol: Any) -> tuple[H1Env, Policy, str]
     require_seed("seed", protocol.seed)
     require_range("threads", options.threads, 0, 4096)
     upper_body = options.laws.configure()
-    for name in ("json", "plot", "video"):
-        _require_folder(name, getattr(options, name, ""))
+    _require_outputs(options)
     if options.threads:
         torch.set_num_threads(options.threads)
     path = _checkpoint(options)
@@ -277,7 +277,7 @@ def velocity_tracking(options: VelocityTrackingOptions) -> dict[str, Any]:
         video = Path(options.video)
         filmed = policy.env_config
         filmed.upper_body = options.laws.configure()
-        tour_video(video, filmed, policy.to("cpu"), video.with_suffix(".png"))
+        tour_video(video, filmed, policy.to("cpu"), _sheet(video))
     return result
 
 
@@ -390,7 +390,7 @@ def scenario(name: str, options: ScenarioOptions) -> dict[str, Any]:
     if options.video:
         from cotap.evaluation.render import film_video
 
-        film_video(Path(options.video), env, trajectory.film, Path(options.video).with_suffix(".png"))
+        film_video(Path(options.video), env, trajectory.film, _sheet(Path(options.video)))
     return result
 
 
@@ -426,7 +426,7 @@ def recording(options: RecordingOptions) -> dict[str, Any]:
     from cotap.evaluation.report import table
 
     options.protocol.check()
-    _require_folder("json", options.json)
+    require_output("--json", options.json)
     start = time.perf_counter()
     loaded = load_recording(options.protocol.file)
     result = {"protocol": "recording", "method": "as recorded", "settings": to_plain(options.protocol)}
@@ -455,10 +455,24 @@ PROTOCOLS: dict[str, tuple[type[Any], Callable[[Any], dict[str, Any]]]] = {
 """Every protocol's options and what runs it."""
 
 
-def _require_folder(name: str, path: str) -> None:
-    """Fail before the work rather than after it."""
-    if path and not Path(path).resolve().parent.is_dir():
-        raise ValueError(f"--{name} {path!r}: its folder does not exist")
+def _require_outputs(options: CommonOptions) -> None:
+    """Fail before the work rather than after it: where results cannot be written, or would replace each other."""
+    video: str = getattr(options, "video", "")
+    require_output("--json", options.json)
+    require_output("--plot", options.plot, (".png",))
+    require_output("--video", video, (".mp4",))
+    wanted = [("--json", options.json), ("--plot", options.plot), ("--video", video)]
+    if video:
+        wanted.append(("the contact sheet of --video", str(_sheet(Path(video)))))
+    named: dict[Path, str] = {}
+    for option, path in wanted:
+        if path and (other := named.setdefault(Path(path).resolve(), option)) != option:
+            raise ValueError(f"{option} and {other} are one file, {path!r}")
+
+
+def _sheet(video: Path) -> Path:
+    """Where a video's contact sheet goes."""
+    return video.with_name(f"{video.stem}_frames.png")
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ from pathlib import Path
 import tyro
 
 from cotap.checks import require_positive_int, require_seed
+from cotap.files import require_output
 
 
 @dataclass
@@ -37,8 +38,7 @@ def main(argv: list[str] | None = None) -> int:
         output = Path(options.output)
         if output.suffix != ".onnx":
             raise ValueError(f"--output must end in .onnx, got {options.output!r}")
-        if not output.resolve().parent.is_dir():
-            raise ValueError(f"--output {options.output!r}: its folder does not exist")
+        require_output("--output", options.output)
         checkpoint = find_checkpoint(options.checkpoint) if options.checkpoint else default_checkpoint()
         summary, worst = export_policy(checkpoint, output, options.checks, options.seed)
     except (ValueError, OSError, ModuleNotFoundError) as error:

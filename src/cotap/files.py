@@ -32,6 +32,27 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     _sync_folder(path.parent)
 
 
+def require_output(option: str, path: Path | str, suffixes: tuple[str, ...] = ()) -> None:
+    """Find out before the work, rather than after it, that a file could not be written; an empty path is none.
+
+    Raises:
+        ValueError: its folder does not exist, it is a folder itself, or it ends in none of `suffixes` (if any).
+        OSError: its folder cannot be written to.
+    """
+    target = Path(path)
+    if not str(path):
+        return
+    if not target.resolve().parent.is_dir():
+        raise ValueError(f"{option} {str(path)!r}: its folder does not exist")
+    if target.is_dir():
+        raise ValueError(f"{option} {str(path)!r} is a folder, not a file")
+    if suffixes and target.suffix.lower() not in suffixes:
+        raise ValueError(f"{option} must end in {' or '.join(suffixes)}, got {str(path)!r}")
+    handle, name = tempfile.mkstemp(prefix=".writable.", dir=target.resolve().parent)
+    os.close(handle)
+    os.unlink(name)
+
+
 def _sync_folder(folder: Path) -> None:
     """Make a rename last through a power cut, where the system can."""
     with contextlib.suppress(OSError):  # Windows opens no folders, and some file systems sync none

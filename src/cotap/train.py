@@ -41,9 +41,10 @@ class BaseOptions:
     """
 
     run_dir: str = ""
-    """Where the run goes; by default runs/base-DATE-TIME, or the resumed checkpoint's folder."""
+    """Where the run goes; by default the folder of the run that is resumed, or else runs/base-DATE-TIME."""
     resume: str = ""
-    """Checkpoint to go on from; its config is the default for every option. auto: the newest in --run-dir, if any."""
+    """Checkpoint to go on from, a file or the name of a shipped one; its config is the default for every option. auto:
+    the newest in --run-dir, if any."""
     recipe: str = "default"
     """default (from nothing to walking); paper (the same with the paper's networks); robust (blows and loads on the
     hands: with --resume, what a policy that walks learns next, from nothing without it); or facet (FACET's tracking
@@ -60,12 +61,13 @@ class DistillOptions:
     """
 
     run_dir: str = ""
-    """Where the run goes; by default runs/distill-DATE-TIME, or the resumed checkpoint's folder."""
+    """Where the run goes; by default the folder of the run that is resumed, or else runs/distill-DATE-TIME."""
     resume: str = ""
-    """Checkpoint of a distillation to go on from; its config is the default for every option. auto: the newest in
-    --run-dir, if any. A shipped one is guided no more."""
+    """Checkpoint of a distillation to go on from, a file or the name of a shipped one; its config is the default for
+    every option. auto: the newest in --run-dir, if any. A shipped one is guided no more."""
     base_checkpoint: str = ""
-    """Base policy to begin from and to be guided by; by default the shipped one."""
+    """Base policy to begin from and to be guided by, a file or the name of a shipped one; by default the shipped
+    one."""
     recipe: str = "default"
     """default (80 to 1200 N/m); paper (150 to 450 N/m); facet (arms under FACET, its tracking reward);
     or an ablation: no-ratio, torque-critic, goals. With --resume an ablation changes that checkpoint's config. The last
@@ -81,6 +83,8 @@ class PipelineOptions:
 
     run_dir: str = ""
     """Where the runs go, into folders `base`, `robust` and `distill`; by default runs/cotap-DATE-TIME."""
+    resume: bool = False
+    """Go on with the runs in --run-dir: what is finished is left, what was stopped goes on, what is missing begins."""
     num_envs: int = 1024
     """Number of worlds."""
     base_iterations: int = 814
@@ -105,10 +109,17 @@ class PipelineOptions:
             require_positive_int(name, getattr(self, name))
         require_range("threads", self.threads, 0, 4096)
         resolve_backend(self.backend)
+        if self.resume and not self.run_dir:
+            raise ValueError("--resume goes on with the runs in --run-dir, which is not given")
+
+
+class Stopped(Exception):
+    """A stage was asked to stop before its end; the message says how to go on."""
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Parse, train, report. Returns the exit status: 0, 2 for bad input, 1 for a training that failed."""
+    """Parse, train, report. Returns the exit status: 0, 2 for bad input, 1 for a training that failed, 130 for both
+    stages stopped before their end, or one before its checkpoint was saved."""
     args = list(sys.argv[1:] if argv is None else argv)
     stage = args.pop(0) if args and not args[0].startswith("-") else ""
     try:
@@ -129,6 +140,9 @@ def main(argv: list[str] | None = None) -> int:
         traceback.print_exception(error.__cause__ or error)
         print(f"error: {error}", file=sys.stderr)
         return 1
+    except Stopped as stop:
+        print(stop, file=sys.stderr)
+        return 130
     except KeyboardInterrupt:  # asked to stop twice
         print("interrupted before the checkpoint was saved; the last one is whole", file=sys.stderr)
         return 130
@@ -136,17 +150,22 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _expand(args: list[str]) -> list[str]:
-    """Arguments with names as the options have them, shortcuts written out, and the checkpoint that auto means."""
+    """Arguments with names as the options have them, shortcuts written out, and the files that checkpoints' names and
+    auto mean."""
     from cotap.agents.runner import CHECKPOINT_PATTERN
+    from cotap.evaluation.policy import CHECKPOINTS, find_checkpoint
 
     args = [_named(key) + sep + value for key, sep, value in (a.partition("=") for a in args)]
+    for option in ("--resume", "--base-checkpoint"):
+        if (given := _peek(args, option)) in CHECKPOINTS:
+            args = [*args, f"{option}={find_checkpoint(given)}"]  # the last one counts
     if _peek(args, "--resume") != "auto":
         return args
     run_dir = _peek(args, "--run-dir")
     if not run_dir:
         raise ValueError("--resume auto looks for checkpoints in --run-dir, which is not given")
     newest = max(Path(run_dir).glob(CHECKPOINT_PATTERN), default="")
-    return [*args, f"--resume={newest}"]  # the last one counts
+    return [*args, f"--resume={newest}"]
 
 
 def _named(key: str) -> str:
@@ -184,6 +203,8 @@ def _parse_distill(args: list[str]) -> DistillOptions:
             require_one_of("recipe with --resume", given, DISTILL_CONTINUATIONS.keys())
             training = DISTILL_CONTINUATIONS[given](training)
         guided = _brings_guide(resumed) and training.env.observations == before.env.observations
+        if guided and base:
+            raise ValueError(f"--base-checkpoint {base!r}: checkpoint {resumed!r} brings the base that guides it")
         if not guided:  # what the base had to say has been learned; iterations count from nothing, and so would beta
             training.distillation.beta = 0.0
             base = base or str(shipped_checkpoint("base"))
@@ -250,11 +271,13 @@ def _train(stage: str, options: BaseOptions | DistillOptions, base: dict[str, An
 
     from cotap.agents.ranks import Ranks
     from cotap.agents.run_log import say
-    from cotap.agents.runner import DualRunner, check_run_dir
+    from cotap.agents.runner import CHECKPOINT_PATTERN, DualRunner, check_run_dir
     from cotap.envs import H1Env
 
     training, ranks = options.training, Ranks.from_environment()
-    resumed_dir = Path(options.resume).parent if options.resume else None
+    resumed = Path(options.resume) if options.resume else None
+    # A checkpoint that is no part of a run, as a shipped one, is gone on from elsewhere.
+    resumed_dir = resumed.parent if resumed and resumed.match(CHECKPOINT_PATTERN) else None
     if ranks.size > 1 and not (options.run_dir or resumed_dir):
         raise ValueError("several processes need one --run-dir, got none")
     run_dir = Path(options.run_dir) if options.run_dir else resumed_dir or _new_run_dir(stage)
@@ -278,7 +301,7 @@ def _train(stage: str, options: BaseOptions | DistillOptions, base: dict[str, An
             runner.load(options.resume, other_terms=options.recipe in OTHER_TERMS)
         # Last, so that nothing is left behind when any of the above refuses.
         if ranks.leads:
-            check_run_dir(run_dir, resuming=resumed_dir is not None and run_dir.resolve() == resumed_dir.resolve())
+            check_run_dir(run_dir, resumed)
         runner.learn(init_at_random_ep_len=True)
     if ranks.leads:
         say(f"{runner.current_learning_iteration} iterations, {runner.wall_seconds:.0f} s: {run_dir}")
@@ -304,6 +327,7 @@ def train_both(options: PipelineOptions) -> Path:
 
     Raises:
         ValueError: an option is out of its range, or this is one of several processes.
+        Stopped: a stage was asked to stop.
     """
     from cotap.agents.ranks import Ranks
 
@@ -311,40 +335,51 @@ def train_both(options: PipelineOptions) -> Path:
     if Ranks.from_environment().size > 1:
         raise ValueError("several processes train stage by stage: python -m cotap.train base, then distill")
     run_dir = Path(options.run_dir) if options.run_dir else _new_run_dir("cotap")
-    common = [
-        "--num-envs", str(options.num_envs), "--seed", str(options.seed), "--threads", str(options.threads),
-        "--backend", options.backend, "--device", options.device,
-    ]  # fmt: skip
-    walking = _train_base_with(
-        [*common, "--iterations", str(options.base_iterations), "--run-dir", str(run_dir / "base")]
-    )
+    walking = _part(options, run_dir / "base", "base", options.base_iterations, [])
     total = options.base_iterations + options.robust_iterations
-    checkpoint = _train_base_with(
-        [*common, "--recipe", "robust", "--resume", walking, "--iterations", str(total),
-         "--run-dir", str(run_dir / "robust")]
-    )  # fmt: skip
-    distill_args = [
-        *common, "--base-checkpoint", checkpoint, "--iterations", str(options.distill_iterations),
-        "--run-dir", str(run_dir / "distill"),
-    ]  # fmt: skip
-    distill = _parse_distill(distill_args)
-    distill.command = " ".join(["python -m cotap.train distill", *distill_args])
-    train_distill(distill)
+    base = _part(options, run_dir / "robust", "base", total, ["--recipe", "robust", "--resume", str(walking)])
+    _part(options, run_dir / "distill", "distill", options.distill_iterations, ["--base-checkpoint", str(base)])
     print(_summary(run_dir))
     return run_dir
 
 
-def _train_base_with(args: list[str]) -> str:
-    """Run stage 1 as if typed with `args`. Returns its newest checkpoint."""
-    options = _parse_base(args)
-    options.command = " ".join(["python -m cotap.train base", *args])
-    return str(_newest(train_base(options)))
+def _part(options: PipelineOptions, run_dir: Path, stage: str, iterations: int, begin: list[str]) -> Path:
+    """Run one part of the pipeline as if typed, up to so many iterations; with `begin` unless it goes on.
+
+    Returns its newest checkpoint. Raises Stopped if that is not its last.
+    """
+    from cotap.agents.checkpoint import load_checkpoint
+
+    newest = _newest(run_dir) if options.resume else None
+    args = [
+        "--num-envs", str(options.num_envs), "--seed", str(options.seed), "--threads", str(options.threads),
+        "--backend", options.backend, "--device", options.device, "--iterations", str(iterations),
+        "--run-dir", str(run_dir), *(["--resume", str(newest)] if newest else begin),
+    ]  # fmt: skip
+    command = " ".join(["python -m cotap.train", stage, *args])
+    if stage == "base":
+        base = _parse_base(args)
+        base.command = command
+        train_base(base)
+    else:
+        distill = _parse_distill(args)
+        distill.command = command
+        train_distill(distill)
+    newest = _newest(run_dir)
+    assert newest, f"{run_dir} holds no checkpoint of a stage that ended"
+    reached = load_checkpoint(newest)["iteration"]
+    if reached < iterations:
+        raise Stopped(
+            f"stopped at iteration {reached} of {iterations} of {run_dir}; the same command with "
+            f"--run-dir {run_dir.parent} --resume goes on"
+        )
+    return newest
 
 
-def _newest(run_dir: Path) -> Path:
+def _newest(run_dir: Path) -> Path | None:
     from cotap.agents.runner import CHECKPOINT_PATTERN
 
-    return max(run_dir.glob(CHECKPOINT_PATTERN))
+    return max(run_dir.glob(CHECKPOINT_PATTERN), default=None)
 
 
 def _summary(run_dir: Path) -> str:
@@ -354,6 +389,7 @@ def _summary(run_dir: Path) -> str:
     lines = ["| run | iterations | samples | seconds | checkpoint |", "|---|---|---|---|---|"]
     for part in ("base", "robust", "distill"):
         path = _newest(run_dir / part)
+        assert path, f"{run_dir / part} holds no checkpoint"
         content = load_checkpoint(path)
         lines.append(
             f"| {part} | {content['iteration']} | {content['samples']:,} | {content['wall_seconds']:.0f} | {path} |"

@@ -120,7 +120,7 @@ def make_runner(
 if __name__ == "__main__":  # RUN_DIR ITERATIONS SIGNAL STEP: train, and send oneself SIGNAL at STEP
     torch.set_num_threads(1)
     folder, count, number, at = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4])
-    check_run_dir(folder, resuming=False)
+    check_run_dir(folder)
     runner = make_runner(folder, count)
     runner.env.on_step = lambda step: os.kill(os.getpid(), signal.Signals(number)) if step == at else None
     runner.learn(init_at_random_ep_len=True)

@@ -568,15 +568,35 @@ def test_a_used_run_directory_is_refused_with_what_to_do(tmp_path: Path):
     make_runner(tmp_path, 4, save_interval=2).learn()
     before = names(tmp_path)
     with pytest.raises(ValueError, match="already holds a run") as error:
-        check_run_dir(tmp_path, resuming=False)
+        check_run_dir(tmp_path)
     assert f"--resume {checkpoint(tmp_path, 4)}" in str(error.value)
     assert "--run-dir" in str(error.value)
-    check_run_dir(tmp_path, resuming=True)
+    check_run_dir(tmp_path, checkpoint(tmp_path, 4))
     assert names(tmp_path) == before
 
 
+def test_going_on_from_an_older_checkpoint_beside_newer_ones_is_refused(tmp_path: Path):
+    """The newest would be what auto finds, and the branch would be lost."""
+    make_runner(tmp_path, 4, save_interval=2).learn()
+    with pytest.raises(ValueError, match="newer checkpoint") as error:
+        check_run_dir(tmp_path, checkpoint(tmp_path, 2))
+    assert f"--resume {checkpoint(tmp_path, 4)}" in str(error.value)
+    check_run_dir(tmp_path / "branch", checkpoint(tmp_path, 2))
+
+
+def test_a_run_that_is_at_its_end_says_so_and_leaves_its_checkpoint(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    make_runner(tmp_path, 2).learn()
+    before = checkpoint(tmp_path, 2).read_bytes()
+    ended = make_runner(tmp_path, 2)
+    ended.load(str(checkpoint(tmp_path, 2)))
+    ended.learn()
+    said = capsys.readouterr()
+    assert "at iteration 2 of 2: nothing to do" in said.out + said.err
+    assert checkpoint(tmp_path, 2).read_bytes() == before
+
+
 def test_a_new_run_directory_is_made_and_left_empty(tmp_path: Path):
-    check_run_dir(tmp_path / "new" / "run", resuming=False)
+    check_run_dir(tmp_path / "new" / "run")
     assert names(tmp_path / "new" / "run") == []
 
 
@@ -584,12 +604,12 @@ def test_a_run_directory_that_cannot_be_is_refused(tmp_path: Path):
     file = tmp_path / "file"
     file.write_text("mine")
     with pytest.raises(ValueError, match="is a file") as error:
-        check_run_dir(file, resuming=False)
+        check_run_dir(file)
     assert repr(str(file)) in str(error.value)
     with pytest.raises(OSError, match="file"):
-        check_run_dir(file / "run", resuming=False)
+        check_run_dir(file / "run")
     with pytest.raises(OSError, match="nowhere"):
-        check_run_dir(Path("/proc/nowhere/run"), resuming=False)
+        check_run_dir(Path("/proc/nowhere/run"))
     assert file.read_text() == "mine"
 
 

@@ -106,6 +106,26 @@ def test_bad_input_is_named(options: list[str], says: str, capsys: pytest.Captur
     assert says in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--json", "{}"], "is a folder"),
+        (["--json", "{}/none/x.json"], "its folder does not exist"),
+        (["--plot", "{}/x.xyz"], "must end in .png"),
+        (["--video", "{}/x.avi"], "must end in .mp4"),
+        (["--json", "{}/a.png", "--plot", "{}/a.png"], "are one file"),
+        (["--plot", "{}/a_frames.png", "--video", "{}/a.mp4"], "are one file"),
+    ],
+)
+def test_outputs_that_cannot_be_are_found_before_the_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, options: list[str], says: str
+):
+    monkeypatch.setattr("cotap.envs.H1Env", None)  # the work must not begin
+    assert main([*SMALL, *(option.format(tmp_path) for option in options)]) == 2
+    assert says in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_plot_is_written(tmp_path: Path):
     run(tmp_path, "--num-envs", "4", "--episode-seconds", "6", "--plot", str(tmp_path / "plot.png"))
     assert (tmp_path / "plot.png").read_bytes()[:4] == b"\x89PNG"

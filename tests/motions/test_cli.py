@@ -28,6 +28,18 @@ def test_import_writes_a_library_and_a_table(tmp_path: Path, spec, capsys):
     assert {c.licence for c in library.clips} == {"my own"}
 
 
+@pytest.mark.parametrize(("output", "message"), [("d.npz", "is a folder"), ("afile/x.npz", "afile")])
+@pytest.mark.usefixtures("in_tmp_path")
+def test_an_output_that_cannot_be_written_is_found_before_the_work(
+    output: str, message: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    Path("d.npz").mkdir()
+    Path("afile").write_text("mine")
+    monkeypatch.setattr("cotap.motions.__main__.import_motions", None)  # the work must not begin
+    assert main(["import", ".", "--output", output]) == 2
+    assert message in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

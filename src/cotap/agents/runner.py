@@ -47,8 +47,9 @@ def layout_of(env: VecEnv, symmetric: bool = True) -> AgentLayout:
     return AgentLayout(widths, groups, slices, getattr(env, "symmetry", None) if symmetric else None)
 
 
-def check_run_dir(run_dir: Path, resuming: bool) -> None:
-    """Refuse a directory that holds another run's checkpoints, or that cannot be written to.
+def check_run_dir(run_dir: Path, resumed: Path | None = None) -> None:
+    """Refuse a directory that holds another run's checkpoints, or newer ones than the one that is resumed, or that
+    cannot be written to.
 
     Raises:
         ValueError: the directory is used; the message says what to do.
@@ -57,10 +58,11 @@ def check_run_dir(run_dir: Path, resuming: bool) -> None:
     if run_dir.exists() and not run_dir.is_dir():
         raise ValueError(f"run directory {str(run_dir)!r} is a file")
     newest = max(run_dir.glob(CHECKPOINT_PATTERN), default=None)
-    if newest and not resuming:
+    own = resumed is not None and resumed.resolve().parent == run_dir.resolve()
+    if newest and not (own and resumed and newest.name <= resumed.name):
+        what = "has a newer checkpoint than that" if own else "already holds a run"
         raise ValueError(
-            f"run directory {str(run_dir)!r} already holds a run; "
-            f"go on with --resume {newest}, or choose another --run-dir"
+            f"run directory {str(run_dir)!r} {what}; go on with --resume {newest}, or choose another --run-dir"
         )
     run_dir.mkdir(parents=True, exist_ok=True)
     probe = run_dir / ".writable"
@@ -118,6 +120,9 @@ class DualRunner(OnPolicyRunner):
         self._stop = False
         first = self.current_learning_iteration
         last = self.runner_cfg.iterations if num_learning_iterations is None else first + num_learning_iterations
+        if first >= last:
+            say(f"at iteration {first} of {last}: nothing to do; --iterations says how many in all")
+            return
         if init_at_random_ep_len and first == 0:
             env.episode_length_buf = torch.randint_like(env.episode_length_buf, high=int(env.max_episode_length))
         ranks.same_everywhere(alg.model)

@@ -15,6 +15,11 @@ from cotap.envs.gait import StepMotion
 from cotap.envs.stance import StanceBalance
 from cotap.robots import RobotSpec
 
+SPIN_RAD_S = 1.0
+"""What walking itself adds to the yaw rate, and what the waist does not give way to."""
+LARGEST_YIELD_RAD = 0.5
+"""How far the waist's target runs ahead at most."""
+
 
 @dataclass
 class ActionConfig:
@@ -67,8 +72,10 @@ class JointTargets:
         self.num_lower = len(spec.lower_joints)
         self.steps = StepMotion(
             spec, model, commands.gait_period_s, cfg.step_lift, cfg.step_stride, commands.step_apart_m,
-            commands.step_clear_m,
+            commands.step_clear_m, commands.step_hold_back_m,
         )  # fmt: skip
+        waist = [body.joint or "" for body in spec.chain(spec.torso_body, spec.base_body)]
+        self._waist, self._waist_yield_s = spec.indices(waist), commands.waist_yield_s
         self.stance = StanceBalance(spec, model)
         twists = [j.axis == (0.0, 0.0, 1.0) for j in spec.joints]
         self.scale = torch.tensor([cfg.twist_scale if twist else cfg.lower_scale for twist in twists])
@@ -93,7 +100,10 @@ class JointTargets:
         target = self.default + self.scale * action
         step = self.steps(command.phase, command.velocity_h, command.yaw_rate)
         step = step + self.steps.giving_way(command.phase, joint_pos, joint_vel)
+        step = step + self.steps.holding_back(command.phase, projected_gravity)
         target[:, self.steps.joints] += (1.0 - command.stand)[:, None, None] * step
+        if self._waist_yield_s > 0.0:
+            target[:, self._waist] += self._giving_way(command, projected_gravity, angular_velocity).unsqueeze(1)
         legs = self.stance.joints
         stance = self.stance(command.height, joint_pos, joint_vel, projected_gravity, angular_velocity)
         share = self.cfg.stance_balance * command.stand[:, None, None]
@@ -102,3 +112,12 @@ class JointTargets:
             upper = slice(self.num_lower, None)
             target[:, upper] += arm_position - self.default[upper]
         return target
+
+    def _giving_way(
+        self, command: Command, projected_gravity: torch.Tensor, angular_velocity: torch.Tensor
+    ) -> torch.Tensor:
+        """How far (N,) [rad] the waist turns with a torso that was turned, so that feet need not take all at once."""
+        yaw_rate = -(projected_gravity * angular_velocity).sum(1)
+        spin = yaw_rate - command.yaw_rate
+        beyond = spin - spin.clamp(-SPIN_RAD_S, SPIN_RAD_S)
+        return (self._waist_yield_s * beyond).clamp(-LARGEST_YIELD_RAD, LARGEST_YIELD_RAD)

@@ -53,6 +53,10 @@ class CommandConfig:
     """How much further apart than in the default pose feet are put while stepping [m]."""
     step_clear_m: float = 0.0
     """Sideways distance of the soles below which the swinging leg rolls outwards while stepping; 0 for never [m]."""
+    step_hold_back_m: float = 0.0
+    """By how much less the swinging foot reaches to where the torso leans, per sine of its tilt [m]."""
+    waist_yield_s: float = 0.0
+    """How far the waist gives way, per rad/s by which the torso turns faster than it should, beyond 1 rad/s [s]."""
     step_timing: bool = False
     """Whether the gait clock jumps to where a robot that was struck catches itself (`StepTiming`)."""
 
@@ -70,6 +74,8 @@ class CommandConfig:
         require_range("commands.gait_period_s", self.gait_period_s, 0.1, 10.0)
         require_range("commands.step_apart_m", self.step_apart_m, 0.0, 0.5)
         require_range("commands.step_clear_m", self.step_clear_m, 0.0, 0.5)
+        require_range("commands.step_hold_back_m", self.step_hold_back_m, 0.0, 2.0)
+        require_range("commands.waist_yield_s", self.waist_yield_s, 0.0, 1.0)
 
 
 @dataclass(frozen=True)

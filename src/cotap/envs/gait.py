@@ -14,6 +14,9 @@ from cotap.robots.chains import chains_between
 STANCE_SHARE = 0.58
 """Part of a stride that a foot spends on the ground."""
 
+LARGEST_HOLD_BACK_M = 0.15
+"""The map from a sole's way to joints is of the first order, and made for small ways."""
+
 AHEAD_S = 0.1
 """How far ahead the swinging foot is seen coming at the other one: about what a leg takes to give way [s]."""
 
@@ -60,11 +63,12 @@ class StepMotion:
         stride: Factor on the sweep.
         apart_m: How much further apart than in the default pose the feet are put.
         clear_m: Sideways distance of two soles below which the swinging one gives way; 0 for never.
+        hold_back_m: By how much less the swinging foot reaches to where the torso leans, per sine of its tilt.
     """
 
     def __init__(
         self, spec: RobotSpec, model: mujoco.MjModel, period_s: float, lift: float = 1.0, stride: float = 1.0,
-        apart_m: float = 0.0, clear_m: float = 0.0,
+        apart_m: float = 0.0, clear_m: float = 0.0, hold_back_m: float = 0.0,
     ) -> None:  # fmt: skip
         chains = [spec.chain(foot.body, spec.base_body) for foot in spec.feet]
         names = [[b.joint or "" for b in chain] for chain in chains]
@@ -77,7 +81,9 @@ class StepMotion:
         kinematics = [_sole_kinematics(spec, model, i, names[i]) for i in range(len(spec.feet))]
         maps, outward, lateral = zip(*kinematics, strict=True)
         # Half of the way that the ground moves during a stance, per unit of velocity.
-        self._per_velocity = 0.5 * stride * STANCE_SHARE * period_s * torch.stack(maps)
+        self._per_metre = torch.stack(maps)
+        self._per_velocity = 0.5 * stride * STANCE_SHARE * period_s * self._per_metre
+        self._hold_back = hold_back_m
         self._lateral = torch.tensor(lateral)
         self._outward = torch.stack(outward)
         self._apart, self._clear = 0.5 * apart_m * self._outward, clear_m
@@ -92,6 +98,19 @@ class StepMotion:
         rates = torch.stack((forward, velocity_h[:, 1:].expand(-1, feet), yaw_rate.unsqueeze(1).expand(-1, feet)), 2)
         stride = (self._per_velocity * rates.unsqueeze(2)).sum(3)
         return self._apart + bump.unsqueeze(2) * self._lift + sweep(phase, feet).unsqueeze(2) * stride
+
+    def holding_back(self, phase: torch.Tensor, projected_gravity: torch.Tensor) -> torch.Tensor:
+        """Offsets (N, F, n) [rad] that keep the swinging foot from reaching too far to where the torso leans.
+
+        A foot that comes down beyond where it would catch the robot throws it to the other side.
+
+        Args:
+            phase: (N,) of the clock.
+            projected_gravity: (N, 3) unit vector in the torso frame.
+        """
+        way = (-self._hold_back * projected_gravity[:, :2]).clamp(-LARGEST_HOLD_BACK_M, LARGEST_HOLD_BACK_M)
+        swings = (swing_progress(phase, self.joints.shape[0]) > 0.0).to(way.dtype)
+        return swings.unsqueeze(2) * (self._per_metre[..., :2] * way[:, None, None]).sum(3)
 
     def giving_way(self, phase: torch.Tensor, joint_pos: torch.Tensor, joint_vel: torch.Tensor) -> torch.Tensor:
         """Offsets (N, F, n) [rad] that keep the swinging foot from the other one, the first two feet being a pair.

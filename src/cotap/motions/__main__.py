@@ -6,6 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from cotap.files import require_output
 from cotap.motions.formats import FORMATS
 from cotap.motions.importer import import_motions, table
 from cotap.motions.library import MotionError, MotionLibrary, shipped_library
@@ -18,7 +19,13 @@ def _parser() -> argparse.ArgumentParser:
     importer = commands.add_parser("import", help="read motion files of any known format into one library")
     importer.add_argument("sources", nargs="+", type=Path, metavar="SOURCE", help="files, or folders to search")
     importer.add_argument("--format", default="auto", choices=("auto", *FORMATS))
-    importer.add_argument("--output", type=Path, required=True, metavar="FILE", help="the library to write (.npz)")
+    importer.add_argument(
+        "--output",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help="the library to write (.npz); one of that name is replaced",
+    )
     importer.add_argument("--mirror", action="store_true", help="add the left-right mirror image of every clip")
     importer.add_argument("--source", default="not stated", help="where the motion comes from, kept in the file")
     importer.add_argument("--licence", default="not stated", help="its terms, kept in the file")
@@ -34,6 +41,8 @@ def _parser() -> argparse.ArgumentParser:
 def _import(options: argparse.Namespace) -> int:
     if options.output.suffix != ".npz":
         raise MotionError(f"--output must end in .npz, got {str(options.output)!r}")
+    options.output.parent.mkdir(parents=True, exist_ok=True)
+    require_output("--output", options.output)
     spec = ROBOTS[options.robot]()
     result = import_motions(
         options.sources, spec, options.format, options.mirror, options.source, options.licence, sys.stderr.isatty()
@@ -41,7 +50,6 @@ def _import(options: argparse.Namespace) -> int:
     print(table(result))
     if not result.clips:
         raise MotionError("no clip could be used; nothing was written")
-    options.output.parent.mkdir(parents=True, exist_ok=True)
     MotionLibrary(result.clips, spec).save(options.output)
     print(f"\nwritten: {options.output}")
     return 0
@@ -64,7 +72,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     try:
         return {"import": _import, "show": _show}[options.command](options)
-    except (MotionError, OSError) as error:
+    except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
 
