@@ -140,6 +140,29 @@ def test_feet_never_give_way_unless_asked_to(spec, model):
     assert not motion.giving_way(torch.tensor([0.79]), crossed, torch.zeros(1, 19)).any()
 
 
+@pytest.mark.parametrize(("phase", "swinging"), [(0.79, 0), (0.29, 1)])
+@pytest.mark.parametrize(("forward", "left"), [(0.2, 0.0), (0.0, 0.2), (-0.15, 0.1)])
+def test_the_swinging_foot_does_not_reach_to_where_the_torso_leans(spec, model, phase, swinging, forward, left):
+    """Forward kinematics: it comes down nearer by the share that was asked for, and the other one stays."""
+    motion = StepMotion(spec, model, PERIOD, hold_back_m=0.3)
+    # Gravity as a torso sees it that leans: forward by a pitch, to its left by a roll.
+    gravity = torch.tensor([[forward, left, -((1.0 - forward**2 - left**2) ** 0.5)]])
+    offsets = motion.holding_back(torch.tensor([phase]), gravity)[0]
+    assert not offsets[1 - swinging].any()
+    joints = np.array([j.default_rad for j in spec.joints])
+    before, _ = sole(spec, model, joints, swinging)
+    joints[motion.joints[swinging].numpy()] += offsets[swinging].numpy()
+    after, _ = sole(spec, model, joints, swinging)
+    np.testing.assert_allclose(after - before, [-0.3 * forward, -0.3 * left, 0.0], atol=6e-3)
+
+
+def test_a_foot_is_held_back_within_bounds_and_only_if_asked_to(spec, model):
+    swing, falling = torch.tensor([0.79]), torch.tensor([[0.9, 0.0, -0.436]])
+    bound = StepMotion(spec, model, PERIOD, hold_back_m=0.3).holding_back(swing, torch.tensor([[0.5, 0.0, -0.866]]))
+    assert torch.equal(StepMotion(spec, model, PERIOD, hold_back_m=0.3).holding_back(swing, falling), bound)
+    assert not StepMotion(spec, model, PERIOD).holding_back(swing, falling).any()
+
+
 def test_factors_scale_lift_and_stride_apart(spec, model):
     phase, velocity, turn = torch.tensor([0.79]), torch.tensor([[0.5, 0.0]]), torch.zeros(1)
     none = StepMotion(spec, model, PERIOD, lift=0.0, stride=0.0)(phase, velocity, turn)
