@@ -25,7 +25,7 @@ from cotap.robots import ROBOTS
 
 WATCH_S = 2.2
 """A robot that is on its feet for so long after the clock was set has caught itself [s]."""
-SOON_STEPS = (1, 8)
+SOON_STEPS = (2, 10)
 """The clock is set so many control steps after a blow."""
 KEEP = 0.3
 """Share of the trials in which the clock goes on as it would."""
