@@ -347,16 +347,21 @@ def test_a_run_repeats_for_its_seed_and_for_no_other(base: Path, tmp_path: Path)
     assert not torch.equal(first["actors.lower.weights.0"], other["actors.lower.weights.0"])
 
 
-def test_sigterm_saves_and_exits_cleanly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def interrupt(monkeypatch: pytest.MonkeyPatch, at: int, number: int) -> None:
+    """Raise a signal in the environment's step of that number."""
     step, calls = H1Env.step, []
 
     def interrupted(self: H1Env, actions: torch.Tensor) -> Any:
         calls.append(1)
-        if len(calls) == 8:
-            signal.raise_signal(signal.SIGTERM)
+        if len(calls) == at:
+            signal.raise_signal(number)
         return step(self, actions)
 
     monkeypatch.setattr(H1Env, "step", interrupted)
+
+
+def test_sigterm_saves_and_exits_cleanly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    interrupt(monkeypatch, 8, signal.SIGTERM)
     content = run_small(tmp_path / "run", ITERATIONS, 50)
     assert content["iteration"] == 2
     assert content["env"] != {}
@@ -505,15 +510,8 @@ def test_stopped_in_a_stage_the_pipeline_ends_there_and_goes_on_from_there(
 ):
     """The second stage must not begin from half a first one."""
     tiny_networks(monkeypatch)
-    step, calls, out = H1Env.step, [], tmp_path / "both"
-
-    def interrupted(self: H1Env, actions: torch.Tensor) -> Any:
-        calls.append(1)
-        if len(calls) == 3:
-            signal.raise_signal(signal.SIGINT)
-        return step(self, actions)
-
-    monkeypatch.setattr(H1Env, "step", interrupted)
+    out = tmp_path / "both"
+    interrupt(monkeypatch, 3, signal.SIGINT)
     assert run(*BOTH, RUN_DIR, out) == 130
     said = capsys.readouterr().err
     assert f"stopped at iteration 1 of 2 of {out / 'base'}" in said
@@ -555,6 +553,10 @@ def test_a_base_that_would_be_ignored_is_refused(checkpoint: Path, tmp_path: Pat
     resumed = max((tmp_path / "run").glob("checkpoint_*.pt"))
     assert run("distill", RESUME, resumed, BASE_CHECKPOINT, checkpoint, ITERATIONS, 3) == 2
     assert "brings the base that guides it" in capsys.readouterr().err
+    # One command that begins a run and, started again, goes on with it.
+    again = ["distill", RESUME, "auto", RUN_DIR, tmp_path / "run", BASE_CHECKPOINT, checkpoint, ITERATIONS, 3]
+    assert run(*again) == 0
+    assert newest(tmp_path / "run")["iteration"] == 3
 
 
 def test_without_a_stage_both_run_and_are_summed_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any):

@@ -194,6 +194,7 @@ def _parse_distill(args: list[str]) -> DistillOptions:
     """Options on top of the resumed checkpoint's config, or else of what the recipe makes of the base's."""
     from cotap.evaluation.policy import shipped_checkpoint
 
+    begins = _peek([_named(a) for a in args], "--resume") == "auto"  # from that base, unless it has begun
     args = _expand(args)
     given, resumed, base = (_peek(args, option) for option in ("--recipe", "--resume", "--base-checkpoint"))
     recipe = require_one_of("recipe", given or "default", DISTILL_RECIPES.keys())
@@ -203,7 +204,7 @@ def _parse_distill(args: list[str]) -> DistillOptions:
             require_one_of("recipe with --resume", given, DISTILL_CONTINUATIONS.keys())
             training = DISTILL_CONTINUATIONS[given](training)
         guided = _brings_guide(resumed) and training.env.observations == before.env.observations
-        if guided and base:
+        if guided and base and not begins:
             raise ValueError(f"--base-checkpoint {base!r}: checkpoint {resumed!r} brings the base that guides it")
         if not guided:  # what the base had to say has been learned; iterations count from nothing, and so would beta
             training.distillation.beta = 0.0
@@ -301,7 +302,7 @@ def _train(stage: str, options: BaseOptions | DistillOptions, base: dict[str, An
             runner.load(options.resume, other_terms=options.recipe in OTHER_TERMS)
         # Last, so that nothing is left behind when any of the above refuses.
         if ranks.leads:
-            check_run_dir(run_dir, resumed)
+            check_run_dir(run_dir, resumed if resumed_dir else None)
         runner.learn(init_at_random_ep_len=True)
     if ranks.leads:
         say(f"{runner.current_learning_iteration} iterations, {runner.wall_seconds:.0f} s: {run_dir}")

@@ -114,6 +114,22 @@ def test_every_mode_is_damped_as_asked(rng, ratio):
         torch.testing.assert_close(d, d.T, atol=1e-10, rtol=0)
 
 
+@pytest.mark.parametrize(("dtype", "atol"), [(torch.float64, 1e-5), (torch.float32, 1e-4)])
+@pytest.mark.parametrize("n", [1, 2, 3, 4, 7])
+def test_damping_is_critical_where_stiffness_spans_four_decades(rng, n, dtype, atol):
+    """`D M^-1 D = 4 K`, by definition; inertia spans two and a half decades."""
+
+    def spd(decades: float) -> torch.Tensor:
+        basis = torch.linalg.qr(torch.randn(500, n, n, dtype=torch.float64, generator=rng))[0]
+        values = 10.0 ** (decades * torch.rand(500, n, dtype=torch.float64, generator=rng))
+        return basis @ torch.diag_embed(values) @ basis.mT
+
+    k, m = spd(4.0), 10**-2.5 * spd(2.5)
+    d = critical_damping(k.to(dtype), m.to(dtype)).double()
+    error = (0.25 * d @ torch.linalg.inv(m) @ d - k).abs().amax((1, 2)) / k.abs().amax((1, 2))
+    assert float(error.max()) < atol
+
+
 def test_critical_damping_by_hand():
     k, m = torch.diag(torch.tensor([100.0, 25.0])), torch.diag(torch.tensor([1.0, 0.25]))
     torch.testing.assert_close(critical_damping(k, m), torch.diag(torch.tensor([20.0, 5.0])))

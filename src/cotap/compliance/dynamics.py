@@ -39,10 +39,7 @@ def gravity_torque(links: LinkInertias, pose: ChainPose, up: torch.Tensor) -> to
     """
     centers = pose.anchors + rotate(pose.rotations, links.com)
     weighted = links.mass.unsqueeze(-1) * centers
-    # What a joint carries is its own link and all beyond.
-    carried = weighted.flip(2).cumsum(2).flip(2)
-    mass = links.mass.flip(1).cumsum(1).flip(1)
-    lever = carried - mass.unsqueeze(-1) * pose.anchors
+    lever = _carried(weighted, 2) - _carried(links.mass, 1).unsqueeze(-1) * pose.anchors
     # The torque of gravity is axis . (lever x -g up); holding still takes the opposite.
     lift = GRAVITY_M_S2 * up[:, None, None, :].expand_as(lever)
     return (pose.axes * torch.linalg.cross(lever, lift)).sum(-1)
@@ -57,14 +54,15 @@ def joint_inertia(links: LinkInertias, pose: ChainPose) -> torch.Tensor:
     # Worlds last: every operation then runs along them.
     anchors, axes, rotations = (x.movedim(0, -1).contiguous() for x in (pose.anchors, pose.axes, pose.rotations))
     centers = anchors + (rotations * links.com[..., None, :, None]).sum(3)
-    first_moment = _carried(links.mass[..., None, None] * centers)
-    xx, xy, xz, yy, yz, zz = _carried(_about_origin(links, rotations, centers)).unbind(2)
+    weighted = links.mass[..., None, None] * centers
+    first_moment = _carried(weighted, 1)
+    xx, xy, xz, yy, yz, zz = _carried(_about_origin(links, rotations, centers, weighted), 1).unbind(2)
     x, y, z = axes.unbind(2)
     spin = torch.stack((xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z), 2)
     # Turning about an axis moves the point of the body that is at the origin.
     origin_velocity = _cross(anchors, axes)
     angular = spin + _cross(first_moment, origin_velocity)
-    linear = _cross(axes, first_moment) + _carried(links.mass)[..., None, None] * origin_velocity
+    linear = _cross(axes, first_moment) + _carried(links.mass, 1)[..., None, None] * origin_velocity
     joints = axes.shape[1]
     inertia = axes.new_empty(axes.shape[0], joints, joints, axes.shape[-1])
     for i in range(joints):
@@ -74,10 +72,14 @@ def joint_inertia(links: LinkInertias, pose: ChainPose) -> torch.Tensor:
     return inertia.movedim(-1, 0)
 
 
-def _about_origin(links: LinkInertias, rotations: torch.Tensor, centers: torch.Tensor) -> torch.Tensor:
-    """Entries xx, xy, xz, yy, yz, zz of the links' inertias about the root's origin, in its frame, (A, n, 6, W)."""
+def _about_origin(
+    links: LinkInertias, rotations: torch.Tensor, centers: torch.Tensor, weighted: torch.Tensor
+) -> torch.Tensor:
+    """Entries xx, xy, xz, yy, yz, zz of the links' inertias about the root's origin, in its frame, (A, n, 6, W).
+
+    `weighted` (A, n, 3, W) are the links' centres times their masses.
+    """
     own = (rotations.unsqueeze(4) * links.inertia[:, :, None, :, :, None]).sum(3)
-    weighted = links.mass[..., None, None] * centers
     square = (weighted * centers).sum(2)
     entries = []
     for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)):
@@ -86,12 +88,12 @@ def _about_origin(links: LinkInertias, rotations: torch.Tensor, centers: torch.T
     return torch.stack(entries, 2)
 
 
-def _carried(x: torch.Tensor) -> torch.Tensor:
-    """Of a quantity of links (A, n, ...), what each joint carries: its own link's and that of all beyond."""
-    parts = list(x.unbind(1))
+def _carried(x: torch.Tensor, links: int) -> torch.Tensor:
+    """Of a quantity of the links along dimension `links`, what each joint carries: its own link's and all beyond."""
+    parts = list(x.unbind(links))
     for i in reversed(range(len(parts) - 1)):
         parts[i] = parts[i] + parts[i + 1]
-    return torch.stack(parts, 1)
+    return torch.stack(parts, links)
 
 
 def _cross(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
@@ -125,7 +127,7 @@ def _diagonalized(symmetric: torch.Tensor, factor: torch.Tensor) -> tuple[torch.
 
     Jacobi's method, all matrices at once: the library's decomposition takes them one by one, which costs twice as long
     for many small ones, and in single precision it is less exact where eigenvalues lie far apart. For n up to 7 as many
-    sweeps as there are columns leave nothing but rounding.
+    sweeps as there are columns leave what single precision rounds anyway; in double precision it is left, too.
     """
     n = symmetric.shape[-1]
     both = torch.cat((symmetric, factor), 1).permute(1, 2, 0).contiguous()

@@ -71,8 +71,7 @@ def inverse_3x3(a: torch.Tensor) -> torch.Tensor:
 
 def _entries(a: torch.Tensor) -> tuple[torch.Tensor, ...]:
     """The six different entries (...) of symmetric matrices (..., 3, 3), each contiguous."""
-    rows = a.flatten(-2).movedim(-1, 0).contiguous()
-    return tuple(rows[i] for i in (0, 1, 2, 4, 5, 8))
+    return a.flatten(-2)[..., [0, 1, 2, 4, 5, 8]].movedim(-1, 0).contiguous().unbind(0)
 
 
 def _plus(a: torch.Tensor, shift: torch.Tensor) -> torch.Tensor:
