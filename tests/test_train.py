@@ -16,9 +16,10 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from cotap import train
 from cotap.agents.checkpoint import load_checkpoint, save_checkpoint
-from cotap.configs import BASE_RECIPES, CONTINUATIONS, BaseTraining, from_plain
+from cotap.configs import BASE_RECIPES, CONTINUATIONS, BaseTraining, from_plain, to_plain
 from cotap.envs import H1Env
 from cotap.envs.rewards import LowerRewards, UpperRewards
+from cotap.envs.upper_body import UpperBodyConfig
 from cotap.evaluation.policy import shipped_checkpoint
 
 # Every option that these tests use, as typed on the command line.
@@ -438,6 +439,31 @@ def test_a_shipped_distilled_policy_goes_on_under_the_base_it_is_given(checkpoin
     assert run("distill", RESUME, shipped, BASE_CHECKPOINT, checkpoint, *more) == 0
     for key, value in load_checkpoint(checkpoint)["model"].items():
         assert torch.equal(newest(tmp_path / "more")["learner"]["guide"][key], value), key
+
+
+def test_a_distilled_policy_begins_a_base_with_its_arms_under_pd(
+    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    distill(tmp_path / "run", checkpoint, "--env.commands.waist-yield-s", 0.07)
+    (distilled,) = (tmp_path / "run").glob("checkpoint_000002.pt")
+    before = tree(tmp_path / "run")
+    monkeypatch.chdir(tmp_path)
+    slow = ["--ppo.learning-rate", 1e-5, "--ppo.epochs", 1, "--ppo.mini-batches", 1]
+    assert run("base", RESUME, distilled, ITERATIONS, 1, *slow) == 0
+    assert tree(tmp_path / "run") == before  # another stage is another run
+    (folder,) = (tmp_path / "runs").iterdir()
+    began, learned = newest(folder), load_checkpoint(distilled)
+    env = began["config"]["training"]["env"]
+    assert began["kind"] == "base"
+    assert "distillation" not in began["config"]["training"]
+    assert env["upper_body"] == to_plain(UpperBodyConfig())
+    assert env["commands"]["waist_yield_s"] == 0.07
+    assert began["iteration"] == 1
+    assert began["samples"] > learned["samples"]
+    assert not began["learner"]["guide"]
+    for key, value in learned["model"].items():
+        if key.startswith("actors"):
+            torch.testing.assert_close(began["model"][key], value, atol=1e-3, rtol=0)
 
 
 @pytest.mark.parametrize(("recipe", "wider"), [("goals", 50), ("torque-critic", -40)])

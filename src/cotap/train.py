@@ -24,6 +24,7 @@ from cotap.configs import (
     OTHER_TERMS,
     BaseTraining,
     DistillTraining,
+    as_base,
     from_plain,
     to_plain,
 )
@@ -44,7 +45,7 @@ class BaseOptions:
     """Where the run goes; by default the folder of the run that is resumed, or else runs/base-DATE-TIME."""
     resume: str = ""
     """Checkpoint to go on from, a file or the name of a shipped one; its config is the default for every option. auto:
-    the newest in --run-dir, if any."""
+    the newest in --run-dir, if any. A distilled policy begins a new run, with its arms back under PD."""
     recipe: str = "default"
     """default (from nothing to walking); paper (the same with the paper's networks); robust (blows and loads on the
     hands: with --resume, what a policy that walks learns next, from nothing without it); or facet (FACET's tracking
@@ -181,7 +182,8 @@ def _parse_base(args: list[str]) -> BaseOptions:
     if recipe:
         require_one_of("recipe", recipe, BASE_RECIPES.keys())
     if resumed:
-        training = _config_of(resumed, BaseTraining)
+        distilled = _stage_of(resumed) == "distill"
+        training = as_base(_config_of(resumed, DistillTraining)) if distilled else _config_of(resumed, BaseTraining)
         if recipe:
             training = CONTINUATIONS[require_one_of("recipe with --resume", recipe, CONTINUATIONS.keys())](training)
     else:
@@ -214,6 +216,12 @@ def _parse_distill(args: list[str]) -> DistillOptions:
         training = DISTILL_RECIPES[recipe](_config_of(base, BaseTraining))
     default = DistillOptions(recipe=recipe, base_checkpoint=base, training=training)
     return tyro.cli(DistillOptions, args=args, default=default, prog="python -m cotap.train distill")
+
+
+def _stage_of(checkpoint: str) -> str:
+    from cotap.agents.checkpoint import load_checkpoint
+
+    return load_checkpoint(checkpoint).get("kind", "base")
 
 
 def _brings_guide(checkpoint: str) -> bool:
@@ -277,8 +285,9 @@ def _train(stage: str, options: BaseOptions | DistillOptions, base: dict[str, An
 
     training, ranks = options.training, Ranks.from_environment()
     resumed = Path(options.resume) if options.resume else None
-    # A checkpoint that is no part of a run, as a shipped one, is gone on from elsewhere.
-    resumed_dir = resumed.parent if resumed and resumed.match(CHECKPOINT_PATTERN) else None
+    # A checkpoint that is no part of a run of this stage, as a shipped one, is gone on from elsewhere.
+    of_a_run = resumed and resumed.match(CHECKPOINT_PATTERN) and _stage_of(options.resume) == stage
+    resumed_dir = resumed.parent if resumed and of_a_run else None
     if ranks.size > 1 and not (options.run_dir or resumed_dir):
         raise ValueError("several processes need one --run-dir, got none")
     run_dir = Path(options.run_dir) if options.run_dir else resumed_dir or _new_run_dir(stage)

@@ -1,4 +1,4 @@
-"""A waist that gives way to a torso that a blow turns."""
+"""A waist that damps the torso, and gives way to what a blow turns."""
 
 from __future__ import annotations
 
@@ -10,9 +10,12 @@ from cotap.envs.commands import Command, CommandConfig
 from cotap.robots.mjcf import build_model
 
 
-def waist_target(spec, yield_s: float, yaw_rate: float, commanded: float = 0.0, lean: float = 0.0) -> float:
+def waist_target(
+    spec, yield_s: float, yaw_rate: float, commanded: float = 0.0, lean: float = 0.0, damping_s: float = 0.0
+) -> float:
     """Where the waist is sent, robot standing, torso turning about the vertical."""
-    targets = JointTargets(ActionConfig(), spec, build_model(spec), CommandConfig(waist_yield_s=yield_s))
+    commands = CommandConfig(waist_yield_s=yield_s, waist_damping_s=damping_s)
+    targets = JointTargets(ActionConfig(), spec, build_model(spec), commands)
     one, none = torch.ones(1), torch.zeros(1, 19)
     command = Command(torch.zeros(1, 2), commanded * one, one, spec.nominal_height_m * one, torch.zeros(1))
     gravity = torch.tensor([[lean, 0.0, -((1.0 - lean**2) ** 0.5)]])
@@ -30,3 +33,18 @@ def test_the_waist_turns_with_what_turns_the_torso_too_fast(spec, yaw_rate, comm
     assert waist_target(spec, 0.05, yaw_rate, commanded) == pytest.approx(expected, abs=1e-5)
     assert waist_target(spec, 0.05, yaw_rate, commanded, lean=0.5) == pytest.approx(expected, abs=1e-5)
     assert waist_target(spec, 0.0, yaw_rate, commanded) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("yaw_rate", "commanded", "expected"),
+    [(0.5, 0.0, -0.02), (-0.5, 0.0, 0.02), (0.0, 0.5, 0.02), (0.8, 0.8, 0.0), (1.0, 0.0, -0.04), (3.0, 0.0, -0.04)],
+)
+def test_the_waist_damps_a_slowly_turning_torso(spec, yaw_rate, commanded, expected):
+    """0.04 rad against each rad/s, up to 1 rad/s."""
+    assert waist_target(spec, 0.0, yaw_rate, commanded, damping_s=0.04) == pytest.approx(expected, abs=1e-5)
+    assert waist_target(spec, 0.0, yaw_rate, commanded, lean=0.5, damping_s=0.04) == pytest.approx(expected, abs=1e-5)
+
+
+def test_beyond_that_it_gives_way(spec):
+    """0.05 rad for each of two rad/s beyond one, less what it resists with."""
+    assert waist_target(spec, 0.05, 3.0, damping_s=0.04) == pytest.approx(0.06, abs=1e-5)

@@ -271,8 +271,9 @@ class DualRunner(OnPolicyRunner):
         content = load_checkpoint(path, map_location or self.device)
         require_parts(path, content, PARTS.keys() - {"agents", "kind"})
         env: Any = self.env
-        if take_over(path, content, self.alg.model, env, other_terms):
-            content.update(learner={}, env={})
+        refitted = take_over(path, content, self.alg.model, env, other_terms)
+        if refitted or content.get("kind", self._kind) != self._kind:  # another stage's optimisers, laws and worlds
+            content.update(learner={}, env={}, others=[])
         fresh: list[str] = []
         try:
             if content["learner"]:
@@ -320,6 +321,11 @@ class DualRunner(OnPolicyRunner):
         drawn = {"device_rng": torch.cuda.get_rng_state(self.device)} if self._on_card else {}
         return {"env": saved, "rng": torch.get_rng_state(), **drawn}
 
+    @property
+    def _kind(self) -> str:
+        """Which stage this is."""
+        return self.config.get("stage", "base")
+
     def _take_random_state(self, mine: dict[str, Any]) -> None:
         """Draw on as the run did that saved `mine`; what it did not save, or drew elsewhere, begins anew."""
         if "rng" in mine:
@@ -338,7 +344,7 @@ class DualRunner(OnPolicyRunner):
     def _content(self, progress: dict[str, float], worlds: bool = True) -> dict[str, Any]:
         env: Any = self.env
         return {
-            "kind": self.config.get("stage", "base"),
+            "kind": self._kind,
             "layout": json.loads(json.dumps(env.layout())),
             "agents": self.alg.layout.to_plain(),
             "config": self.config,

@@ -1,7 +1,7 @@
 """Recipes: named functions that return fresh configs."""
 
 from cotap.configs.base import BASE_RECIPES, CONTINUATIONS, BaseTraining
-from cotap.configs.distill import DISTILL_CONTINUATIONS, DISTILL_RECIPES, OTHER_TERMS, DistillTraining
+from cotap.configs.distill import DISTILL_CONTINUATIONS, DISTILL_RECIPES, OTHER_TERMS, DistillTraining, as_base
 from cotap.configs.serialization import from_plain, to_plain
 
 __all__ = [
@@ -12,6 +12,7 @@ __all__ = [
     "OTHER_TERMS",
     "BaseTraining",
     "DistillTraining",
+    "as_base",
     "from_plain",
     "to_plain",
 ]

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 from cotap.agents.distillation import DistillationConfig
 from cotap.configs.base import BaseTraining, let_legs_collide, reward_as_facet
+from cotap.envs.upper_body import UpperBodyConfig
 
 
 @dataclass
@@ -94,6 +95,16 @@ def facet(base: BaseTraining) -> DistillTraining:
     env.upper_body.left.name = env.upper_body.right.name = "facet"
     reward_as_facet(env)
     return training
+
+
+def as_base(training: DistillTraining) -> BaseTraining:
+    """Stage 1 as a distilled policy goes on with it: its own environment, arms back under PD, no guide."""
+    env = copy.deepcopy(training.env)
+    env.upper_body = UpperBodyConfig()
+    return BaseTraining(
+        seed=training.seed, threads=training.threads, device=training.device, env=env,
+        ppo=copy.deepcopy(training.ppo), runner=copy.deepcopy(training.runner),
+    )  # fmt: skip
 
 
 DISTILL_CONTINUATIONS: dict[str, Callable[[DistillTraining], DistillTraining]] = {

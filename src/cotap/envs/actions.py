@@ -16,8 +16,8 @@ from cotap.envs.stance import StanceBalance
 from cotap.robots import RobotSpec
 
 SPIN_RAD_S = 1.0
-"""What walking itself adds to the yaw rate, and what the waist does not give way to."""
-LARGEST_YIELD_RAD = 0.5
+"""What walking itself adds to the yaw rate: up to here the waist resists, beyond it gives way."""
+LARGEST_TURN_RAD = 0.5
 """How far the waist's target runs ahead at most."""
 
 
@@ -75,7 +75,8 @@ class JointTargets:
             commands.step_clear_m, commands.step_hold_back_m,
         )  # fmt: skip
         waist = [body.joint or "" for body in spec.chain(spec.torso_body, spec.base_body)]
-        self._waist, self._waist_yield_s = spec.indices(waist), commands.waist_yield_s
+        self._waist = spec.indices(waist)
+        self._waist_yield_s, self._waist_damping_s = commands.waist_yield_s, commands.waist_damping_s
         self.stance = StanceBalance(spec, model)
         twists = [j.axis == (0.0, 0.0, 1.0) for j in spec.joints]
         self.scale = torch.tensor([cfg.twist_scale if twist else cfg.lower_scale for twist in twists])
@@ -102,8 +103,8 @@ class JointTargets:
         step = step + self.steps.giving_way(command.phase, joint_pos, joint_vel)
         step = step + self.steps.holding_back(command.phase, projected_gravity)
         target[:, self.steps.joints] += (1.0 - command.stand)[:, None, None] * step
-        if self._waist_yield_s > 0.0:
-            target[:, self._waist] += self._giving_way(command, projected_gravity, angular_velocity).unsqueeze(1)
+        if self._waist_yield_s > 0.0 or self._waist_damping_s > 0.0:
+            target[:, self._waist] += self._waist_turn(command, projected_gravity, angular_velocity).unsqueeze(1)
         legs = self.stance.joints
         stance = self.stance(command.height, joint_pos, joint_vel, projected_gravity, angular_velocity)
         share = self.cfg.stance_balance * command.stand[:, None, None]
@@ -113,11 +114,16 @@ class JointTargets:
             target[:, upper] += arm_position - self.default[upper]
         return target
 
-    def _giving_way(
+    def _waist_turn(
         self, command: Command, projected_gravity: torch.Tensor, angular_velocity: torch.Tensor
     ) -> torch.Tensor:
-        """How far (N,) [rad] the waist turns with a torso that was turned, so that feet need not take all at once."""
+        """How far (N,) [rad] the waist turns against what shakes the torso, and with what throws it around.
+
+        Damping the torso in the world keeps the sway of steps and the arms' reaction from it; a blow would throw the
+        whole robot around, so beyond `SPIN_RAD_S` the waist gives way and feet need not take all at once.
+        """
         yaw_rate = -(projected_gravity * angular_velocity).sum(1)
         spin = yaw_rate - command.yaw_rate
-        beyond = spin - spin.clamp(-SPIN_RAD_S, SPIN_RAD_S)
-        return (self._waist_yield_s * beyond).clamp(-LARGEST_YIELD_RAD, LARGEST_YIELD_RAD)
+        slow = spin.clamp(-SPIN_RAD_S, SPIN_RAD_S)
+        turn = self._waist_yield_s * (spin - slow) - self._waist_damping_s * slow
+        return turn.clamp(-LARGEST_TURN_RAD, LARGEST_TURN_RAD)

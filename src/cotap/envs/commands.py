@@ -57,6 +57,9 @@ class CommandConfig:
     """By how much less the swinging foot reaches to where the torso leans, per sine of its tilt [m]."""
     waist_yield_s: float = 0.0
     """How far the waist gives way, per rad/s by which the torso turns faster than it should, beyond 1 rad/s [s]."""
+    waist_damping_s: float = 0.0
+    """How far the waist turns against the torso, per rad/s by which it turns faster than it should, up to 1 rad/s [s].
+    From 0.1 on control delay makes it shake instead."""
     step_timing: bool = False
     """Whether the gait clock jumps to where a robot that was struck catches itself (`StepTiming`)."""
 
@@ -76,6 +79,7 @@ class CommandConfig:
         require_range("commands.step_clear_m", self.step_clear_m, 0.0, 0.5)
         require_range("commands.step_hold_back_m", self.step_hold_back_m, 0.0, 2.0)
         require_range("commands.waist_yield_s", self.waist_yield_s, 0.0, 1.0)
+        require_range("commands.waist_damping_s", self.waist_damping_s, 0.0, 0.2)
 
 
 @dataclass(frozen=True)
