@@ -163,6 +163,20 @@ def test_a_foot_is_held_back_within_bounds_and_only_if_asked_to(spec, model):
     assert not StepMotion(spec, model, PERIOD).holding_back(swing, falling).any()
 
 
+@pytest.mark.parametrize(("tilt", "share"), [(0.0, 0.0), (0.05, 0.0), (0.125, 0.5), (0.2, 1.0), (0.9, 1.0)])
+@pytest.mark.parametrize("towards", [(1.0, 0.0), (0.0, -1.0), (0.6, 0.8)])
+def test_the_swinging_foot_is_lifted_higher_under_a_torso_that_leans(spec, model, tilt, share, towards):
+    """Half as high again where it leans by 0.2 or more, nothing below 0.05, and the other foot stays."""
+    phase, still, turn = torch.tensor([0.79]), torch.zeros(1, 2), torch.zeros(1)
+    gravity = torch.tensor([[-tilt * towards[0], -tilt * towards[1], -((1.0 - tilt**2) ** 0.5)]])
+    motion = StepMotion(spec, model, PERIOD, catch_lift=0.5)
+    lift = motion(phase, still, turn)
+    torch.testing.assert_close(motion.catching(phase, gravity), 0.5 * share * lift, atol=1e-5, rtol=0)
+    assert lift[0, 0].any()
+    assert not lift[0, 1].any()
+    assert not StepMotion(spec, model, PERIOD).catching(phase, gravity).any()
+
+
 def test_factors_scale_lift_and_stride_apart(spec, model):
     phase, velocity, turn = torch.tensor([0.79]), torch.tensor([[0.5, 0.0]]), torch.zeros(1)
     none = StepMotion(spec, model, PERIOD, lift=0.0, stride=0.0)(phase, velocity, turn)

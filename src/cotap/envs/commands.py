@@ -55,6 +55,8 @@ class CommandConfig:
     """Sideways distance of the soles below which the swinging leg rolls outwards while stepping; 0 for never [m]."""
     step_hold_back_m: float = 0.0
     """By how much less the swinging foot reaches to where the torso leans, per sine of its tilt [m]."""
+    step_catch_lift: float = 0.0
+    """By what share of itself the swinging foot's lift grows under a torso that leans far."""
     waist_yield_s: float = 0.0
     """How far the waist gives way, per rad/s by which the torso turns faster than it should, beyond 1 rad/s [s]."""
     waist_damping_s: float = 0.0
@@ -78,6 +80,7 @@ class CommandConfig:
         require_range("commands.step_apart_m", self.step_apart_m, 0.0, 0.5)
         require_range("commands.step_clear_m", self.step_clear_m, 0.0, 0.5)
         require_range("commands.step_hold_back_m", self.step_hold_back_m, 0.0, 2.0)
+        require_range("commands.step_catch_lift", self.step_catch_lift, 0.0, 2.0)
         require_range("commands.waist_yield_s", self.waist_yield_s, 0.0, 1.0)
         require_range("commands.waist_damping_s", self.waist_damping_s, 0.0, 0.2)
 

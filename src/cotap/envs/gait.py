@@ -14,6 +14,9 @@ from cotap.robots.chains import chains_between
 STANCE_SHARE = 0.58
 """Part of a stride that a foot spends on the ground."""
 
+CATCH_TILT = (0.05, 0.2)
+"""Sines of the tilt at which the swinging foot begins to be lifted higher, and at which it is lifted highest."""
+
 LARGEST_HOLD_BACK_M = 0.15
 """The map from a sole's way to joints is of the first order, and made for small ways."""
 
@@ -64,11 +67,12 @@ class StepMotion:
         apart_m: How much further apart than in the default pose the feet are put.
         clear_m: Sideways distance of two soles below which the swinging one gives way; 0 for never.
         hold_back_m: By how much less the swinging foot reaches to where the torso leans, per sine of its tilt.
+        catch_lift: By what share of itself the lift grows under a torso that leans far.
     """
 
     def __init__(
         self, spec: RobotSpec, model: mujoco.MjModel, period_s: float, lift: float = 1.0, stride: float = 1.0,
-        apart_m: float = 0.0, clear_m: float = 0.0, hold_back_m: float = 0.0,
+        apart_m: float = 0.0, clear_m: float = 0.0, hold_back_m: float = 0.0, catch_lift: float = 0.0,
     ) -> None:  # fmt: skip
         chains = [spec.chain(foot.body, spec.base_body) for foot in spec.feet]
         names = [[b.joint or "" for b in chain] for chain in chains]
@@ -83,7 +87,7 @@ class StepMotion:
         # Half of the way that the ground moves during a stance, per unit of velocity.
         self._per_metre = torch.stack(maps)
         self._per_velocity = 0.5 * stride * STANCE_SHARE * period_s * self._per_metre
-        self._hold_back = hold_back_m
+        self._hold_back, self._catch_lift = hold_back_m, catch_lift
         self._lateral = torch.tensor(lateral)
         self._outward = torch.stack(outward)
         self._apart, self._clear = 0.5 * apart_m * self._outward, clear_m
@@ -92,12 +96,28 @@ class StepMotion:
     def __call__(self, phase: torch.Tensor, velocity_h: torch.Tensor, yaw_rate: torch.Tensor) -> torch.Tensor:
         """Offsets (N, F, n) [rad] for the clock's phase (N,), velocities (N, 2) and yaw rates (N,)."""
         feet = self.joints.shape[0]
-        bump = torch.sin(torch.pi * swing_progress(phase, feet)).square()
         # The ground under a foot at (0, y) moves at -(v + w x r): turning adds -w y forwards.
         forward = velocity_h[:, :1] - yaw_rate.unsqueeze(1) * self._lateral
         rates = torch.stack((forward, velocity_h[:, 1:].expand(-1, feet), yaw_rate.unsqueeze(1).expand(-1, feet)), 2)
         stride = (self._per_velocity * rates.unsqueeze(2)).sum(3)
-        return self._apart + bump.unsqueeze(2) * self._lift + sweep(phase, feet).unsqueeze(2) * stride
+        return self._apart + self._lifting(phase) + sweep(phase, feet).unsqueeze(2) * stride
+
+    def _lifting(self, phase: torch.Tensor) -> torch.Tensor:
+        """Offsets (N, F, n) [rad] that lift the swinging foot."""
+        bump = torch.sin(torch.pi * swing_progress(phase, self.joints.shape[0])).square()
+        return bump.unsqueeze(2) * self._lift
+
+    def catching(self, phase: torch.Tensor, projected_gravity: torch.Tensor) -> torch.Tensor:
+        """Offsets (N, F, n) [rad] that lift the swinging foot higher under a torso that leans far, so that what
+        is to catch the robot meets neither the floor nor the other leg on its way.
+
+        Args:
+            phase: (N,) of the clock.
+            projected_gravity: (N, 3) unit vector in the torso frame.
+        """
+        first, full = CATCH_TILT
+        share = ((projected_gravity[:, :2].norm(dim=1) - first) / (full - first)).clamp(0.0, 1.0)
+        return (self._catch_lift * share)[:, None, None] * self._lifting(phase)
 
     def holding_back(self, phase: torch.Tensor, projected_gravity: torch.Tensor) -> torch.Tensor:
         """Offsets (N, F, n) [rad] that keep the swinging foot from reaching too far to where the torso leans.

@@ -54,7 +54,7 @@ HURRY_S = 0.8
 """For how long a robot that catches itself steps faster [s]."""
 REST_S = 0.25
 """Time between two jumps of the clock [s]: a step must be taken before it can be judged."""
-GAIN = 0.25
+GAIN = 0.2
 """By how much a jump must lower the chance of a fall."""
 
 
