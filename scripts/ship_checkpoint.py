@@ -57,10 +57,14 @@ EVALUATIONS = {
 """What vouches for each policy; the small one is repeated by the tests."""
 
 
-def earlier_runs(run_dirs: list[Path]) -> list[dict[str, Any]]:
-    """Command and commit of the runs that a policy went through before its own, from their config.json."""
-    runs = [json.loads((path / "config.json").read_text()) for path in run_dirs]
-    return [{key: run[key] for key in ("command", "commit")} for run in runs]
+def earlier_runs(before: list[Path]) -> list[dict[str, Any]]:
+    """Command and commit of the runs that a policy went through before its own: of a folder, the run of its
+    config.json; of a shipped policy's description, all of that policy's."""
+    runs: list[dict[str, Any]] = []
+    for path in before:
+        run = json.loads((path / "config.json" if path.is_dir() else path).read_text())
+        runs += [*run.get("earlier_runs", []), {key: run[key] for key in ("command", "commit")}]
+    return runs
 
 
 def ship(source: Path, name: str, before: list[Path]) -> int:
@@ -101,8 +105,8 @@ def main() -> int:
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("--name", default="base", choices=EVALUATIONS)
     parser.add_argument(
-        "--before", type=Path, nargs="*", default=[], metavar="RUN_DIR",
-        help="folders of the runs that this one went on from, oldest first",
+        "--before", type=Path, nargs="*", default=[], metavar="RUN",
+        help="runs that this one went on from, oldest first: folders, or a shipped policy's JSON for all of its own",
     )  # fmt: skip
     options = parser.parse_args()
     return ship(options.checkpoint, options.name, options.before)
