@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cotap.agents.checkpoint import load_checkpoint, save_checkpoint, sha256, write_json
+from cotap.configs import BaseTraining, DistillTraining, from_plain, to_plain
 from cotap.evaluate import main as evaluate
 from cotap.evaluation.policy import checkpoint_path
 
@@ -67,7 +68,26 @@ def earlier_runs(before: list[Path]) -> list[dict[str, Any]]:
     return runs
 
 
-def ship(source: Path, name: str, before: list[Path]) -> int:
+def changed(training: dict[str, Any], stage: str, changes: dict[str, float]) -> dict[str, Any]:
+    """A run's config with other numbers in it.
+
+    Raises:
+        ValueError: a key is not that of a number in the config, or a value is out of its range.
+    """
+    config = from_plain(DistillTraining if stage == "distill" else BaseTraining, training)
+    for key, value in changes.items():
+        *path, field = key.split(".")
+        owner: Any = config
+        for part in path:
+            owner = getattr(owner, part, None)
+        if not isinstance(getattr(owner, field, None), float):
+            raise ValueError(f"{key!r} is no number of the config")
+        setattr(owner, field, value)
+    config.check()
+    return to_plain(config)
+
+
+def ship(source: Path, name: str, before: list[Path], changes: dict[str, float]) -> int:
     """Strip, save, describe, evaluate. Returns the exit status."""
     earlier = earlier_runs(before)
     content = load_checkpoint(source)
@@ -75,6 +95,7 @@ def ship(source: Path, name: str, before: list[Path]) -> int:
     target.parent.mkdir(exist_ok=True)
     # Where the machine keeps the repository is nobody's business.
     config = content["config"] | {"command": content["config"]["command"].replace(f"{Path.cwd()}/", "")}
+    config["training"] = changed(config["training"], content["kind"], changes)
     save_checkpoint(target, content | {"learner": {}, "env": {}, "others": [], "config": config})
     write_json(
         target.with_suffix(".json"),
@@ -84,6 +105,7 @@ def ship(source: Path, name: str, before: list[Path]) -> int:
             "commit": config["commit"],
             "command": config["command"],
             "earlier_runs": earlier,
+            "changed_after_training": changes,
             "seed": config["training"]["seed"],
             "iterations": content["iteration"],
             "samples": content["samples"],
@@ -108,8 +130,13 @@ def main() -> int:
         "--before", type=Path, nargs="*", default=[], metavar="RUN",
         help="runs that this one went on from, oldest first: folders, or a shipped policy's JSON for all of its own",
     )  # fmt: skip
+    parser.add_argument(
+        "--change", nargs="*", default=[], metavar="KEY=VALUE",
+        help="numbers of the config that the policy is shipped with instead of those it was trained with",
+    )  # fmt: skip
     options = parser.parse_args()
-    return ship(options.checkpoint, options.name, options.before)
+    pairs = [text.partition("=") for text in options.change]
+    return ship(options.checkpoint, options.name, options.before, {key: float(value) for key, _, value in pairs})
 
 
 if __name__ == "__main__":

@@ -65,6 +65,7 @@ def robust(training: BaseTraining | None = None) -> BaseTraining:
     let_legs_collide(env)
     env.commands.steady_rad = STEADY_RAD
     env.commands.step_timing = True
+    env.commands.waist_damping_s = 0.04
     env.commands.stand_probability = 0.3
     env.blows.enabled = True
     env.hand_forces.episode_share = 0.6

@@ -120,11 +120,13 @@ class JointTargets:
     ) -> torch.Tensor:
         """How far (N,) [rad] the waist turns against what shakes the torso, and with what throws it around.
 
-        Damping the torso in the world keeps the sway of steps and the arms' reaction from it; a blow would throw the
-        whole robot around, so beyond `SPIN_RAD_S` the waist gives way and feet need not take all at once.
+        Damping the torso in the world keeps the sway of steps and the arms' reaction from it. It fades up to
+        `SPIN_RAD_S`: a blow would throw the whole robot around, so the waist gives way and feet need not take all at
+        once.
         """
         yaw_rate = -(projected_gravity * angular_velocity).sum(1)
         spin = yaw_rate - command.yaw_rate
         slow = spin.clamp(-SPIN_RAD_S, SPIN_RAD_S)
-        turn = self._waist_yield_s * (spin - slow) - self._waist_damping_s * slow
+        resisted = slow * (1.0 - slow.abs() / SPIN_RAD_S)
+        turn = self._waist_yield_s * (spin - slow) - self._waist_damping_s * resisted
         return turn.clamp(-LARGEST_TURN_RAD, LARGEST_TURN_RAD)

@@ -60,8 +60,8 @@ class CommandConfig:
     waist_yield_s: float = 0.0
     """How far the waist gives way, per rad/s by which the torso turns faster than it should, beyond 1 rad/s [s]."""
     waist_damping_s: float = 0.0
-    """How far the waist turns against the torso, per rad/s by which it turns faster than it should, up to 1 rad/s [s].
-    From 0.1 on control delay makes it shake instead."""
+    """How far the waist turns against the torso, per rad/s by which it turns faster than it should [s]; fading up to
+    1 rad/s. From 0.1 s on control delay makes it shake instead."""
     step_timing: bool = False
     """Whether the gait clock jumps to where a robot that was struck catches itself (`StepTiming`)."""
 
