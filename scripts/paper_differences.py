@@ -49,7 +49,7 @@ without. How faithful its stiffness is, with its own arm actions and without, is
 
 SINGULAR = """Without the ratio arms do not keep stretched postures, as in the paper. Here the law does that by itself:
 CoTaP's own policy leaves them as far once the ratio is left out of its law. With arms that move and no blow, e_upper is
-{law} rad then, {trained} rad for the policy that learned 2.5 M samples without, {ratio} rad with the ratio;
+{law} rad then, {trained} rad for the policy that went on learning without, {ratio} rad with the ratio;
 [stretched arms](#singular-postures-the-papers-fig-6) that were struck stay {struck} rad from their reference, {kept}
 rad with the ratio. Next to a singularity the law leaves a joint almost without stiffness. What longer training without
 the ratio would teach was not tried."""
@@ -59,7 +59,7 @@ arm is at rest at every moment, and gravity less J^T F holds it whatever its sti
 agree. Much less torque needs another pose or another load."""
 
 OBSERVATION = """Without arm torque in the actor's observation e_torso changes by {change} m/s, x by {x}, y by {y}. The
-paper's Fig. 8 shows more. Our ablation is CoTaP's own run, refitted to what it sees and trained for 2.5 M samples more,
+paper's Fig. 8 shows more. Our ablation is CoTaP's own policy, refitted to what it sees and trained a little longer,
 instead of a training from nothing."""
 
 

@@ -194,8 +194,8 @@ def ablations(book: Book, motion: str, quick: bool) -> None:
     behind = ", ".join(f"`{name}` {n / 1e6:.1f} M" for name, n in trained if n)
     book.add(
         "",
-        "One seed each. The three that were trained under their change are CoTaP's own run but for their last 100 "
-        f"iterations (2.5 M samples). Samples behind each: {behind}.",
+        "One seed each. The three that were trained under their change go on from CoTaP's own networks. "
+        f"Samples behind each: {behind}.",
         "",
     )
     for other, row in (("without the ratio", "without-the-ratio"), ("without training", "no-training")):
