@@ -1,4 +1,4 @@
-"""What distillation did: does the CoTaP policy walk as well as its base at every stiffness, does one policy obey the
+"""What distillation did: does the CoTaP policy walk as well as the base at every stiffness, does one policy obey the
 stiffness that it is asked for, and does it keep its feet while that changes. Writes docs/distillation.md."""
 
 from __future__ import annotations

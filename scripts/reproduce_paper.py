@@ -163,7 +163,7 @@ def ablations(book: Book, motion: str, quick: bool) -> None:
         "## Ablation (the paper's Table IV)",
         "",
         f"Impact of 500 N in stance at K_ee 100, {envs} worlds a row. *No training*: the base's legs, raw reference as "
-        "arm target.",
+        "arm target; that base has met compliance before, since it goes on from a CoTaP policy.",
         "",
         "| what | e_torso [m/s] | e_upper [rad] | the same without the blow [rad] | fell | paper: e_torso / e_upper |",
         "|---|---|---|---|---|---|",

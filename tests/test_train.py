@@ -458,12 +458,25 @@ def test_a_distilled_policy_begins_a_base_with_its_arms_under_pd(
     assert "distillation" not in began["config"]["training"]
     assert env["upper_body"] == to_plain(UpperBodyConfig())
     assert env["commands"]["waist_yield_s"] == 0.07
+    assert train._parse_base([f"{RESUME}={distilled}"]).training.runner.iterations == 1225
     assert began["iteration"] == 1
     assert began["samples"] > learned["samples"]
     assert not began["learner"]["guide"]
     for key, value in learned["model"].items():
         if key.startswith("actors"):
             torch.testing.assert_close(began["model"][key], value, atol=1e-3, rtol=0)
+
+
+def test_a_stage_does_not_resume_the_other_where_that_makes_no_sense(
+    checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    assert run("distill", RESUME, checkpoint) == 2
+    assert "begins from it with --base-checkpoint" in capsys.readouterr().err
+    distill(tmp_path / "run", checkpoint)
+    before = tree(tmp_path / "run")
+    assert run("base", RESUME, "auto", RUN_DIR, tmp_path / "run") == 2
+    assert "is of a distillation" in capsys.readouterr().err
+    assert tree(tmp_path / "run") == before
 
 
 @pytest.mark.parametrize(("recipe", "wider"), [("goals", 50), ("torque-critic", -40)])

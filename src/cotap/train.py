@@ -177,12 +177,17 @@ def _named(key: str) -> str:
 
 def _parse_base(args: list[str]) -> BaseOptions:
     """Options on top of the resumed checkpoint's config, or else of the recipe's."""
+    newest = _peek([_named(a) for a in args], "--resume") == "auto"
     args = _expand(args)
     recipe, resumed = _peek(args, "--recipe"), _peek(args, "--resume")
     if recipe:
         require_one_of("recipe", recipe, BASE_RECIPES.keys())
     if resumed:
         distilled = _stage_of(resumed) == "distill"
+        if distilled and newest:
+            raise ValueError(
+                f"--resume auto: {resumed} is of a distillation; a base that begins from it is another run"
+            )
         training = as_base(_config_of(resumed, DistillTraining)) if distilled else _config_of(resumed, BaseTraining)
         if recipe:
             training = CONTINUATIONS[require_one_of("recipe with --resume", recipe, CONTINUATIONS.keys())](training)
@@ -201,6 +206,8 @@ def _parse_distill(args: list[str]) -> DistillOptions:
     given, resumed, base = (_peek(args, option) for option in ("--recipe", "--resume", "--base-checkpoint"))
     recipe = require_one_of("recipe", given or "default", DISTILL_RECIPES.keys())
     if resumed:
+        if _stage_of(resumed) != "distill":
+            raise ValueError(f"--resume {resumed!r}: not of a distillation; one begins from it with --base-checkpoint")
         before = training = _config_of(resumed, DistillTraining)
         if given:
             require_one_of("recipe with --resume", given, DISTILL_CONTINUATIONS.keys())

@@ -84,7 +84,8 @@ def robust(training: BaseTraining | None = None) -> BaseTraining:
 def let_legs_collide(env: H1EnvConfig) -> None:
     """All shapes meet, and feet keep apart: legs that may pass through each other learn to, and trip anywhere else."""
     env.collision = "full"
-    env.commands.step_apart_m, env.commands.step_clear_m = 0.04, 0.15
+    commands = env.commands
+    commands.step_apart_m, commands.step_clear_m = max(commands.step_apart_m, 0.04), max(commands.step_clear_m, 0.15)
 
 
 def facet() -> BaseTraining:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 from cotap.agents.distillation import DistillationConfig
 from cotap.configs.base import BaseTraining, let_legs_collide, reward_as_facet
+from cotap.configs.base import default as base_default
 from cotap.envs.upper_body import UpperBodyConfig
 
 
@@ -100,11 +101,12 @@ def facet(base: BaseTraining) -> DistillTraining:
 
 def as_base(training: DistillTraining) -> BaseTraining:
     """Stage 1 as a distilled policy goes on with it: its own environment, arms back under PD, no guide."""
-    env = copy.deepcopy(training.env)
+    env, runner = copy.deepcopy(training.env), copy.deepcopy(training.runner)
     env.upper_body = UpperBodyConfig()
+    runner.iterations = base_default().runner.iterations  # counted anew
     return BaseTraining(
         seed=training.seed, threads=training.threads, device=training.device, env=env,
-        ppo=copy.deepcopy(training.ppo), runner=copy.deepcopy(training.runner),
+        ppo=copy.deepcopy(training.ppo), runner=runner,
     )  # fmt: skip
 
 

@@ -23,8 +23,11 @@ from cotap.play.controls import AXES, Control, Ranges, make_controls
 from cotap.play.forces import HandLoads, Push
 from cotap.play.sample import Sample, take_sample
 
-GAIT = ("gait_period_s", "step_apart_m", "step_clear_m", "step_timing")
-"""Fields of `CommandConfig` that shape what is fed forward to the legs."""
+GAIT = (
+    "gait_period_s", "step_apart_m", "step_clear_m", "step_hold_back_m", "step_catch_lift", "waist_yield_s",
+    "waist_damping_s", "step_timing",
+)  # fmt: skip
+"""Fields of `CommandConfig` that shape what is fed forward to legs and waist."""
 
 
 class Session:
