@@ -28,17 +28,26 @@ from cotap.envs.observations import ObservationHistory, actor_terms
 from cotap.evaluation.policy import load_policy, shipped_checkpoint
 from cotap.export import main as export
 
+FED_FORWARD = (
+    "step_apart_m", "step_clear_m", "step_hold_back_m", "step_catch_lift", "waist_yield_s", "waist_damping_s",
+)  # fmt: skip
 
-@pytest.mark.parametrize(("apart_m", "clear_m"), [(0.0, 0.0), (0.04, 0.4)])
-def test_targets_are_the_environments_while_walking_standing_and_crouching(apart_m, clear_m, make_env, tmp_path):
+
+@pytest.mark.parametrize(
+    "fed_forward",
+    [
+        dict.fromkeys(FED_FORWARD, 0.0),
+        dict(zip(FED_FORWARD, (0.04, 0.4, 0.45, 0.5, 0.05, 0.04), strict=True)),
+    ],
+)
+def test_targets_are_the_environments_while_walking_standing_and_crouching(fed_forward, make_env, tmp_path):
     """The graph must contain all that the environment feeds forward; the arms' advance is added outside."""
     content = load_checkpoint(shipped_checkpoint("base"))
-    widths = {"step_apart_m": apart_m, "step_clear_m": clear_m}
-    content["config"]["training"]["env"]["commands"].update(widths)
+    content["config"]["training"]["env"]["commands"].update(fed_forward)
     save_checkpoint(tmp_path / "apart.pt", content)
     export_policy(tmp_path / "apart.pt", tmp_path / "apart.onnx", checks=20)
     policy = OnnxPolicy(tmp_path / "apart.onnx")
-    env = make_env(6, collision="feet", commands=CommandConfig(step_apart_m=apart_m, step_clear_m=clear_m))
+    env = make_env(6, collision="feet", commands=CommandConfig(**fed_forward))
     env.cfg.hand_forces.enabled = False
     env.commands.override(
         torch.tensor([[0.7, 0.0], [-0.4, 0.3], [0.0, 0.0], [0.0, 0.0], [0.3, -0.2], [0.0, 0.0]]),
