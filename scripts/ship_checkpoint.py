@@ -136,7 +136,12 @@ def main() -> int:
     )  # fmt: skip
     options = parser.parse_args()
     pairs = [text.partition("=") for text in options.change]
-    return ship(options.checkpoint, options.name, options.before, {key: float(value) for key, _, value in pairs})
+    try:
+        changes = {key: float(value) for key, _, value in pairs}
+        return ship(options.checkpoint, options.name, options.before, changes)
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
 
 
 if __name__ == "__main__":

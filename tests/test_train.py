@@ -623,6 +623,13 @@ def test_a_recipe_that_goes_on_changes_the_checkpoints_config(monkeypatch: pytes
     assert not kept.env.blows.enabled
 
 
+def test_feet_that_are_further_apart_than_a_recipe_asks_stay_so():
+    wide = BaseTraining()
+    wide.env.commands.step_apart_m, wide.env.commands.step_clear_m = 0.05, 0.1
+    commands = CONTINUATIONS["robust"](wide).env.commands
+    assert (commands.step_apart_m, commands.step_clear_m) == (0.05, 0.15)
+
+
 def test_a_recipe_that_begins_from_nothing_does_not_resume(checkpoint: Path, capsys: pytest.CaptureFixture[str]):
     assert run("base", RESUME, checkpoint, RECIPE, "paper") == 2
     said = capsys.readouterr().err

@@ -58,6 +58,11 @@ def require_interval(name: str, value: tuple[float, float]) -> tuple[float, floa
     return value
 
 
+def reason_of(error: BaseException) -> str:
+    """First line of what an error says, or its kind if it says nothing."""
+    return (str(error) or type(error).__name__).splitlines()[0]
+
+
 def require_one_of(name: str, value: str, known: Collection[str]) -> str:
     """Return `value` if it is among the `known` names; the error lists them and the closest."""
     if value not in known:

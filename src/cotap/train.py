@@ -169,6 +169,11 @@ def _expand(args: list[str]) -> list[str]:
     return [*args, f"--resume={newest}"]
 
 
+def _resumes_newest(args: list[str]) -> bool:
+    """Whether `--resume auto` is asked for, of arguments as they were typed."""
+    return _peek([_named(arg) for arg in args], "--resume") == "auto"
+
+
 def _named(key: str) -> str:
     """An option's name as `_peek` looks for it; the parser takes underscores for hyphens."""
     key = key.replace("_", "-") if key.startswith("--") else key
@@ -177,7 +182,7 @@ def _named(key: str) -> str:
 
 def _parse_base(args: list[str]) -> BaseOptions:
     """Options on top of the resumed checkpoint's config, or else of the recipe's."""
-    newest = _peek([_named(a) for a in args], "--resume") == "auto"
+    newest = _resumes_newest(args)
     args = _expand(args)
     recipe, resumed = _peek(args, "--recipe"), _peek(args, "--resume")
     if recipe:
@@ -201,7 +206,7 @@ def _parse_distill(args: list[str]) -> DistillOptions:
     """Options on top of the resumed checkpoint's config, or else of what the recipe makes of the base's."""
     from cotap.evaluation.policy import shipped_checkpoint
 
-    begins = _peek([_named(a) for a in args], "--resume") == "auto"  # from that base, unless it has begun
+    begins = _resumes_newest(args)  # from that base, unless it has begun
     args = _expand(args)
     given, resumed, base = (_peek(args, option) for option in ("--recipe", "--resume", "--base-checkpoint"))
     recipe = require_one_of("recipe", given or "default", DISTILL_RECIPES.keys())

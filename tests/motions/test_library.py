@@ -140,6 +140,8 @@ def test_missing_and_damaged_files(tmp_path, spec):
     with pytest.raises(MotionError, match="does not exist"):
         MotionLibrary.load(tmp_path / "no.npz", spec)
     (tmp_path / "text.npz").write_text("hello")
+    with pytest.raises(MotionError, match="cannot be read from disk"):
+        MotionLibrary.load(tmp_path, spec)
     with pytest.raises(MotionError, match="damaged"):
         MotionLibrary.load(tmp_path / "text.npz", spec)
 

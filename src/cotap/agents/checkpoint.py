@@ -14,6 +14,7 @@ from typing import Any
 
 import torch
 
+from cotap.checks import reason_of
 from cotap.files import write_atomically
 
 FORMAT = "cotap-checkpoint"
@@ -86,7 +87,7 @@ def load_checkpoint(path: Path | str, device: str = "cpu") -> dict[str, Any]:
         _refuse_compressed(data)
         content = torch.load(io.BytesIO(data), map_location=device, weights_only=True)
     except Exception as error:  # on rubbish, torch's restricted unpickler raises whatever its reading stumbles over
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        reason = reason_of(error)
         raise CheckpointError(f"checkpoint {str(path)!r} cannot be read (truncated or foreign): {reason}") from error
     if not isinstance(content, dict) or not same(content.get("format"), FORMAT):
         raise CheckpointError(f"{str(path)!r} is not a cotap checkpoint")

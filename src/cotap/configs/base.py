@@ -10,7 +10,7 @@ import torch
 
 from cotap.agents.dual_ppo import DualPPOConfig
 from cotap.agents.runner_config import RunnerConfig
-from cotap.checks import require_range
+from cotap.checks import reason_of, require_range
 from cotap.envs import H1EnvConfig
 from cotap.envs.commands import STEADY_RAD
 
@@ -35,7 +35,7 @@ class BaseTraining:
         try:
             torch.empty(0, device=self.device)
         except (RuntimeError, AssertionError) as error:
-            raise ValueError(f"device {self.device!r} cannot be used here: {str(error).splitlines()[0]}") from error
+            raise ValueError(f"device {self.device!r} cannot be used here: {reason_of(error)}") from error
         self.env.check()
         self.ppo.check()
         self.runner.check()

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from cotap.checks import reason_of
 from cotap.deployment.metadata import ACTION, INPUT, TARGETS, PolicyError, PolicyMetadata, read_metadata
 
 
@@ -43,7 +44,7 @@ class OnnxPolicy:
             properties = self._session.get_modelmeta().custom_metadata_map
             inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
         except Exception as error:  # onnxruntime's errors share no base but this
-            raise PolicyError(f"{where} cannot be read as ONNX: {str(error).splitlines()[0]}") from error
+            raise PolicyError(f"{where} cannot be read as ONNX: {reason_of(error)}") from error
         self.metadata = read_metadata(where, properties)
         joints, width = len(self.metadata.joints), self.metadata.observation_width
         self._require(where, "inputs", inputs, {INPUT: [1, width]})
@@ -73,7 +74,7 @@ class OnnxPolicy:
         try:
             (targets, action), (moved, other) = (self(observation) for observation in observations)
         except Exception as error:  # a graph that cannot be run fails in onnxruntime's own ways, which share no base
-            raise PolicyError(f"{where} cannot be run: {str(error).splitlines()[0]}") from error
+            raise PolicyError(f"{where} cannot be run: {reason_of(error)}") from error
         expected = np.array(self.metadata.action_scale_rad) * (other - action)
         if not np.allclose(moved - targets, expected, rtol=0.0, atol=1e-4):
             raise PolicyError(f"{where}: its targets do not move by metadata action_scale_rad times its actions")

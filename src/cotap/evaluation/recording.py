@@ -85,6 +85,8 @@ def load_recording(path: Path | str) -> Recording:
         head = json.loads(str(arrays.pop("head")))
         kind, version = head["format"], head["version"]
         settings = head["settings"]
+    except OSError as error:
+        raise RecordingError(f"recording {str(path)!r} cannot be read from disk: {error}") from error
     except Exception as error:  # zip, zlib, numpy and JSON each fail in ways of their own on rubbish
         raise RecordingError(f"{str(path)!r} is not a cotap recording, or is truncated: {error}") from error
     if kind != FORMAT or version != VERSION:

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from cotap.agents.actors import as_dict
+from cotap.checks import reason_of
 from cotap.envs import H1Env, H1EnvConfig
 from cotap.envs.commands import STEADY_RAD
 from cotap.evaluation.quiet import quiet
@@ -49,9 +50,8 @@ def open_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Rend
     except ValueError:  # a picture larger than the model's frame buffer: the caller's mistake, not the machine's
         raise
     except Exception as error:  # GLFW, EGL and OSMesa raise kinds of their own, which share no base but this
-        reason = (str(error) or type(error).__name__).splitlines()[0]
         raise RenderingUnavailable(
-            f"cannot render here ({reason}). Set MUJOCO_GL=egl on a machine with a GPU driver, or "
+            f"cannot render here ({reason_of(error)}). Set MUJOCO_GL=egl on a machine with a GPU driver, or "
             "install OSMesa (Debian, Ubuntu: apt-get install libosmesa6) and set MUJOCO_GL=osmesa; now MUJOCO_GL="
             f"{os.environ.get('MUJOCO_GL', 'unset')}"
         ) from error

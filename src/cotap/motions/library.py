@@ -178,6 +178,8 @@ def read_npz(path: str | Path) -> dict[str, np.ndarray]:
             return {key: file[key] for key in file.files}
     except FileNotFoundError as error:
         raise MotionError(f"motion file {str(path)!r} does not exist") from error
+    except OSError as error:
+        raise MotionError(f"motion file {str(path)!r} cannot be read from disk: {error}") from error
     except MotionError:
         raise
     except Exception as error:  # zip, zlib and numpy each fail in ways of their own on rubbish

@@ -1,0 +1,62 @@
+"""What scripts/ship_checkpoint.py writes down of a policy: its runs, and what was changed after them."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
+import ship_checkpoint as sc
+
+from cotap.configs import BASE_RECIPES, BaseTraining, DistillTraining, from_plain, to_plain
+
+HOLD_BACK, CATCH_LIFT = "env.commands.step_hold_back_m", "env.commands.step_catch_lift"
+
+
+def test_runs_are_listed_oldest_first_and_a_shipped_policy_stands_for_all_of_its_own(tmp_path):
+    def run(name: str) -> dict[str, str]:
+        return {"command": f"train {name}", "commit": name}
+
+    shipped, folder = tmp_path / "old.json", tmp_path / "run"
+    shipped.write_text(json.dumps(run("b") | {"earlier_runs": [run("a")], "seed": 0}))
+    folder.mkdir()
+    (folder / "config.json").write_text(json.dumps(run("c") | {"machine": "m"}))
+    assert sc.earlier_runs([shipped, folder]) == [run("a"), run("b"), run("c")]
+
+
+@pytest.mark.parametrize(("stage", "kind"), [("base", BaseTraining), ("distill", DistillTraining)])
+def test_only_what_is_named_is_changed(stage, kind):
+    training = to_plain(kind())
+    before = json.dumps(training)
+    changed = sc.changed(training, stage, {HOLD_BACK: 0.45, CATCH_LIFT: 0.5})
+    expected = json.loads(before)
+    expected["env"]["commands"] |= {"step_hold_back_m": 0.45, "step_catch_lift": 0.5}
+    assert changed == expected
+    assert json.dumps(training) == before
+    assert from_plain(kind, changed).env.commands.step_hold_back_m == 0.45
+
+
+@pytest.mark.parametrize(
+    ("change", "needle"),
+    [
+        ("env.commands.no_such=1", "'env.commands.no_such' is no number"),
+        ("env.commands=1", "'env.commands' is no number"),
+        ("nowhere.at.all=1", "'nowhere.at.all' is no number"),
+        ("env.num_envs=2", "'env.num_envs' is no number"),
+        (f"{HOLD_BACK}=-1", "commands.step_hold_back_m"),
+        (f"{HOLD_BACK}=far", "far"),
+        (HOLD_BACK, "could not convert"),
+    ],
+)
+def test_changes_that_cannot_be_made_are_named_and_nothing_is_shipped(change, needle, tmp_path, monkeypatch, capsys):
+    target = tmp_path / "out" / "base.pt"
+    monkeypatch.setattr(sc, "checkpoint_path", lambda _: target)
+    content = {"kind": "base", "config": {"command": "train", "training": to_plain(BASE_RECIPES["default"]())}}
+    monkeypatch.setattr(sc, "load_checkpoint", lambda _: content)
+    monkeypatch.setattr(sys, "argv", ["ship_checkpoint.py", "c.pt", "--change", change])
+    assert sc.main() == 2
+    assert needle in capsys.readouterr().err
+    assert not list((tmp_path / "out").glob("*"))
