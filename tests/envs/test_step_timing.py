@@ -11,7 +11,17 @@ import torch
 from cotap.agents.actors import as_dict
 from cotap.envs import H1Env, H1EnvConfig, step_timing
 from cotap.envs.commands import HURRY, Catch, CommandConfig, CommandSource
-from cotap.envs.step_timing import BINS, GAIN, HURRY_S, REST_S, StepTiming, feature_reflection, features, risk_at
+from cotap.envs.step_timing import (
+    BINS,
+    CORRECTION_GAIN,
+    GAIN,
+    HURRY_S,
+    REST_S,
+    StepTiming,
+    feature_reflection,
+    features,
+    risk_at,
+)
 from cotap.evaluation.disturbance import Impact
 from cotap.evaluation.policy import load_policy, shipped_checkpoint
 from cotap.robots import ROBOTS
@@ -99,6 +109,50 @@ def test_jumps_only_for_a_gain_and_not_again_at_once(env: H1Env, judged: StepTim
     assert hurried == pytest.approx(HURRY_S / DT, abs=2)
 
 
+@pytest.mark.parametrize(("correct_s", "corrections"), [(0.0, 0), (0.1, 5)])
+def test_a_jump_is_corrected_for_a_while_and_for_less(env, judged, correct_s: float, corrections: int) -> None:
+    """The first jump asks for a gain, corrections for less of one; what is left of the time counts from the first."""
+    judged._correct_s = correct_s
+    walking = dataclasses.replace(env.commands.current(), stand=torch.zeros(16), phase=torch.full((16,), 3 / BINS))
+    standing = dataclasses.replace(walking, stand=torch.ones(16))
+    nobody = torch.zeros(16, dtype=torch.bool)
+    judged.risk_now = torch.full((16, BINS + 1), 0.5)
+    judged.risk_now[:, 20] = 0.5 - GAIN - 0.01
+    assert judged.step(env.state, walking, nobody).jumps.all()
+    judged.risk_now = torch.full((16, BINS + 1), 0.5)
+    judged.risk_now[:8, 9] = 0.5 - CORRECTION_GAIN - 0.01
+    judged.risk_now[8:, 9] = 0.5 - CORRECTION_GAIN + 0.01
+    assert not judged.step(env.state, standing, nobody).jumps.any()
+    catches = [judged.step(env.state, walking, nobody) for _ in range(12)]
+    assert [bool(c.jumps[0]) for c in catches] == [True] * max(corrections - 1, 0) + [False] * (
+        12 - max(corrections - 1, 0)
+    )
+    assert not torch.stack([c.jumps[8:] for c in catches]).any()
+    if corrections:
+        torch.testing.assert_close(catches[0].phase[:8], torch.full((8,), 9 / BINS))
+
+
+def test_rest_counts_from_the_last_correction(env, judged) -> None:
+    judged._correct_s = 0.1
+    command = dataclasses.replace(env.commands.current(), stand=torch.zeros(16), phase=torch.full((16,), 3 / BINS))
+    nobody = torch.zeros(16, dtype=torch.bool)
+    judged.risk_now = torch.full((16, BINS + 1), 0.5)
+    judged.risk_now[:, 20] = 0.2
+    jumps = [bool(judged.step(env.state, command, nobody).jumps[0]) for _ in range(30)]
+    series = round(0.1 / DT) + 1
+    assert jumps[:series] == [True] * series
+    again = jumps.index(True, series)
+    assert again - (series - 1) == pytest.approx(REST_S / DT, abs=2)
+
+
+def test_states_saved_before_jumps_were_corrected_are_taken() -> None:
+    timing_ = timing(3)
+    timing_.load_state_dict({"_since_s": torch.tensor([0.0, 0.3, math.inf])})
+    assert timing_._since_first_s.tolist() == timing_._since_s.tolist()
+    with pytest.raises(ValueError, match="_since_s"):
+        timing_.load_state_dict({})
+
+
 def test_a_standing_robot_is_judged_by_standing_on_and_must_step_when_it_leans(env: H1Env, judged: StepTiming) -> None:
     command = dataclasses.replace(env.commands.current(), stand=torch.ones(16), phase=torch.zeros(16))
     risk = torch.full((16, BINS + 1), 0.5)
@@ -126,9 +180,10 @@ def test_the_clock_jumps_starts_and_hurries() -> None:
 
 def test_an_environment_with_it_uses_it_restarts_it_and_saves_it() -> None:
     cfg = H1EnvConfig(num_envs=4, num_threads=1)
-    cfg.commands.step_timing = True
+    cfg.commands.step_timing, cfg.commands.step_correct_s = True, 0.1
     env = H1Env(cfg)
     assert env.step_timing is not None
+    assert env.step_timing._correct_s == 0.1
     env.step_timing._since_s[:] = 0.1
     env.step(torch.zeros(4, env.num_actions))
     torch.testing.assert_close(env.step_timing._since_s, torch.full((4,), 0.1 + DT))

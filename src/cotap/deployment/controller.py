@@ -119,7 +119,7 @@ class Controller:
         self._rng = torch.Generator().manual_seed(seed)
         self._everyone = torch.ones(1, dtype=torch.bool)
         self.commands = CommandSource(commands, 1, spec.nominal_height_m, self.dt)
-        self._timing = StepTiming(spec, 1, self.dt) if commands.step_timing else None
+        self._timing = StepTiming(spec, 1, self.dt, commands.step_correct_s) if commands.step_timing else None
         self.motion = motion
         self.upper_body = UpperBody(laws, spec, 1, self.dt, torch.float64)
         terms = actor_terms(len(spec.joints), len(spec.upper_joints))

@@ -64,6 +64,8 @@ class CommandConfig:
     1 rad/s. From 0.1 s on control delay makes it shake instead."""
     step_timing: bool = False
     """Whether the gait clock jumps to where a robot that was struck catches itself (`StepTiming`)."""
+    step_correct_s: float = 0.0
+    """For how long after a jump of the clock it may be corrected; 0 for not at all [s]."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
@@ -83,6 +85,7 @@ class CommandConfig:
         require_range("commands.step_catch_lift", self.step_catch_lift, 0.0, 2.0)
         require_range("commands.waist_yield_s", self.waist_yield_s, 0.0, 1.0)
         require_range("commands.waist_damping_s", self.waist_damping_s, 0.0, 0.2)
+        require_range("commands.step_correct_s", self.step_correct_s, 0.0, 1.0)
 
 
 @dataclass(frozen=True)

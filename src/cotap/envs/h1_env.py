@@ -204,7 +204,9 @@ class H1Env(VecEnv):
         self._weight_n = float(model.body_mass.sum()) * GRAVITY
 
         self.commands = CommandSource(cfg.commands, n, spec.nominal_height_m, self.dt)
-        self.step_timing = StepTiming(spec, n, self.dt) if cfg.commands.step_timing else None
+        self.step_timing = (
+            StepTiming(spec, n, self.dt, cfg.commands.step_correct_s) if cfg.commands.step_timing else None
+        )
         self.motions = ReferenceMotion(cfg.motions, spec, n, self.dt)
         self.path = PathFollower(cfg.impedance, n, self.dt)
         self.hand_forces = HandForces(cfg.hand_forces, n, len(spec.arms), self.dt)

@@ -10,6 +10,7 @@ import io
 import math
 from importlib import resources
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import torch
@@ -56,6 +57,8 @@ REST_S = 0.25
 """Time between two jumps of the clock [s]: a step must be taken before it can be judged."""
 GAIN = 0.2
 """By how much a jump must lower the chance of a fall."""
+CORRECTION_GAIN = 0.05
+"""The same of a jump that corrects the one before: the foot has hardly moved, so that less has to be gained."""
 
 
 class StepTiming(Stateful):
@@ -66,18 +69,21 @@ class StepTiming(Stateful):
         spec: The robot.
         num_envs: Number of worlds.
         dt: Control step [s].
+        correct_s: For how long after a jump it may be corrected [s]: the first one comes in the middle of a blow.
 
     Raises:
         ValueError: the shipped weights are for another number of joints.
     """
 
-    STATE = ("_since_s",)
+    STATE = ("_since_s", "_since_first_s")
 
-    def __init__(self, spec: RobotSpec, num_envs: int, dt: float) -> None:
-        self._dt = dt
+    def __init__(self, spec: RobotSpec, num_envs: int, dt: float, correct_s: float = 0.0) -> None:
+        self._dt, self._correct_s = dt, correct_s
         self._default = torch.tensor([j.default_rad for j in spec.joints])
         self._since_s = torch.full((num_envs,), math.inf)
         """Since the clock jumped."""
+        self._since_first_s = torch.full((num_envs,), math.inf)
+        """Since it jumped and was not correcting a jump."""
         self.model = FallRisk(feature_reflection(spec)).eval()
         stored = resources.files("cotap.envs").joinpath(_WEIGHTS).read_bytes()
         with np.load(io.BytesIO(stored), allow_pickle=False) as weights:
@@ -89,7 +95,11 @@ class StepTiming(Stateful):
 
     def reset(self, mask: torch.Tensor) -> None:
         """Worlds in `mask` (N,) start anew."""
-        self._since_s[mask] = math.inf
+        self._since_s[mask] = self._since_first_s[mask] = math.inf
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """As of any `Stateful`; states that were saved before jumps were corrected have had first jumps only."""
+        super().load_state_dict({"_since_first_s": state.get("_since_s"), **state})
 
     @torch.no_grad()
     def risk(self, s: RobotState, command: Command) -> torch.Tensor:
@@ -109,8 +119,12 @@ class StepTiming(Stateful):
         least, point = risk[:, :BINS].min(1)
         stands = command.stand > 0.5
         present = torch.where(stands, risk[:, BINS], risk_at(risk, command.phase))
-        jumps = (present - least > GAIN) & (self._since_s > REST_S) | (stands & leans)
+        gain = present - least
+        first = (gain > GAIN) & (self._since_s > REST_S) | (stands & leans)
+        corrects = (gain > CORRECTION_GAIN) & (self._since_first_s + 0.5 * self._dt < self._correct_s) & ~stands
+        jumps = first | corrects
         self._since_s = torch.where(jumps, 0.0, self._since_s + self._dt)
+        self._since_first_s = torch.where(first, 0.0, self._since_first_s + self._dt)
         return Catch(jumps, point / BINS, self._since_s < HURRY_S)
 
 
