@@ -29,7 +29,8 @@ from cotap.evaluation.policy import load_policy, shipped_checkpoint
 from cotap.export import main as export
 
 FED_FORWARD = (
-    "step_apart_m", "step_clear_m", "step_hold_back_m", "step_catch_lift", "waist_yield_s", "waist_damping_s",
+    "step_apart_m", "step_clear_m", "step_hold_back_m", "step_catch_lift", "step_roll_damping_s",
+    "step_twist_damping_s", "step_straighten_rad", "waist_yield_s", "waist_damping_s",
 )  # fmt: skip
 
 
@@ -37,7 +38,7 @@ FED_FORWARD = (
     "fed_forward",
     [
         dict.fromkeys(FED_FORWARD, 0.0),
-        dict(zip(FED_FORWARD, (0.04, 0.4, 0.45, 0.5, 0.05, 0.04), strict=True)),
+        dict(zip(FED_FORWARD, (0.04, 0.4, 0.45, 0.5, 0.02, 0.01, 0.01, 0.05, 0.04), strict=True)),
     ],
 )
 def test_targets_are_the_environments_while_walking_standing_and_crouching(fed_forward, make_env, tmp_path):

@@ -177,6 +177,36 @@ def test_the_swinging_foot_is_lifted_higher_under_a_torso_that_leans(spec, model
     assert not StepMotion(spec, model, PERIOD).catching(phase, gravity).any()
 
 
+def test_legs_damp_rolling_and_twisting_joints_and_no_other(spec, model):
+    """Each rad/s sends a hip that rolls 0.02 rad and one that turns 0.01 rad the other way, on both legs alike."""
+    motion = StepMotion(spec, model, PERIOD, roll_damping_s=0.02, twist_damping_s=0.01)
+    velocity = 1.0 + torch.arange(len(spec.joints)).unsqueeze(0)
+    offsets = motion.damping(velocity)[0]
+    assert torch.equal(motion.damping(-velocity)[0], -offsets)
+    for foot, side in enumerate(("left", "right")):
+        sent = dict(zip([spec.joint_names[i] for i in motion.joints[foot]], offsets[foot].tolist(), strict=True))
+        for name, damping_s in {"hip_roll": 0.02, "hip_yaw": 0.01, "hip_pitch": 0.0, "knee": 0.0, "ankle": 0.0}.items():
+            moving = 1.0 + spec.joint_names.index(f"{side}_{name}")
+            assert sent[f"{side}_{name}"] == pytest.approx(-damping_s * moving)
+    assert not StepMotion(spec, model, PERIOD).damping(velocity).any()
+
+
+def test_knees_that_are_straightened_put_soles_further_down(spec, model):
+    motion = StepMotion(spec, model, PERIOD, lift=0.0, stride=0.0, straighten_rad=0.03)
+    offsets = motion(torch.tensor([0.3]), torch.zeros(1, 2), torch.zeros(1))[0]
+    default = np.array([j.default_rad for j in spec.joints])
+    joints = default.copy()
+    for foot in range(2):
+        joints[motion.joints[foot].numpy()] += offsets[foot].numpy()
+    bent_less = dict(zip(spec.joint_names, default - joints, strict=True))
+    assert {name: angle for name, angle in bent_less.items() if angle} == pytest.approx(
+        {"left_knee": 0.03, "right_knee": 0.03}
+    )
+    for foot in range(2):
+        (was, _), (now, _) = sole(spec, model, default, foot), sole(spec, model, joints, foot)
+        assert now[2] < was[2] - 1e-3
+
+
 def test_factors_scale_lift_and_stride_apart(spec, model):
     phase, velocity, turn = torch.tensor([0.79]), torch.tensor([[0.5, 0.0]]), torch.zeros(1)
     none = StepMotion(spec, model, PERIOD, lift=0.0, stride=0.0)(phase, velocity, turn)

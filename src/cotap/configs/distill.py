@@ -37,6 +37,8 @@ def default(base: BaseTraining) -> DistillTraining:
     env.commands.step_hold_back_m, env.commands.step_catch_lift = 0.45, 0.5
     env.commands.waist_yield_s, env.commands.waist_damping_s = 0.05, 0.04
     env.commands.step_correct_s = 0.1
+    env.commands.step_roll_damping_s, env.commands.step_twist_damping_s = 0.02, 0.006
+    env.commands.step_straighten_rad = 0.01
     for law in (env.upper_body.left, env.upper_body.right):
         law.name, law.damping = "cotap", "critical"
     env.upper_body.sampling.enabled = True

@@ -72,7 +72,8 @@ class JointTargets:
         self.num_lower = len(spec.lower_joints)
         self.steps = StepMotion(
             spec, model, commands.gait_period_s, cfg.step_lift, cfg.step_stride, commands.step_apart_m,
-            commands.step_clear_m, commands.step_hold_back_m, commands.step_catch_lift,
+            commands.step_clear_m, commands.step_hold_back_m, commands.step_catch_lift, commands.step_roll_damping_s,
+            commands.step_twist_damping_s, commands.step_straighten_rad,
         )  # fmt: skip
         waist = [body.joint or "" for body in spec.chain(spec.torso_body, spec.base_body)]
         self._waist = spec.indices(waist)
@@ -103,6 +104,7 @@ class JointTargets:
         step = step + self.steps.giving_way(command.phase, joint_pos, joint_vel)
         step = step + self.steps.holding_back(command.phase, projected_gravity)
         step = step + self.steps.catching(command.phase, projected_gravity)
+        step = step + self.steps.damping(joint_vel)
         target[:, self.steps.joints] += (1.0 - command.stand)[:, None, None] * step
         if self._waist_yield_s > 0.0 or self._waist_damping_s > 0.0:
             target[:, self._waist] += self._waist_turn(command, projected_gravity, angular_velocity).unsqueeze(1)

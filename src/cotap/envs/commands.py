@@ -57,6 +57,12 @@ class CommandConfig:
     """By how much less the swinging foot reaches to where the torso leans, per sine of its tilt [m]."""
     step_catch_lift: float = 0.0
     """By what share of itself the swinging foot's lift grows under a torso that leans far."""
+    step_roll_damping_s: float = 0.0
+    """How far joints of the legs that roll are sent against their velocity while stepping [s]; adds to PD's damping."""
+    step_twist_damping_s: float = 0.0
+    """The same of joints that turn about the vertical [s]."""
+    step_straighten_rad: float = 0.0
+    """By how much less than in the default pose knees are bent while stepping [rad]."""
     waist_yield_s: float = 0.0
     """How far the waist gives way, per rad/s by which the torso turns faster than it should, beyond 1 rad/s [s]."""
     waist_damping_s: float = 0.0
@@ -83,6 +89,9 @@ class CommandConfig:
         require_range("commands.step_clear_m", self.step_clear_m, 0.0, 0.5)
         require_range("commands.step_hold_back_m", self.step_hold_back_m, 0.0, 2.0)
         require_range("commands.step_catch_lift", self.step_catch_lift, 0.0, 2.0)
+        require_range("commands.step_roll_damping_s", self.step_roll_damping_s, 0.0, 0.1)
+        require_range("commands.step_twist_damping_s", self.step_twist_damping_s, 0.0, 0.1)
+        require_range("commands.step_straighten_rad", self.step_straighten_rad, -0.2, 0.2)
         require_range("commands.waist_yield_s", self.waist_yield_s, 0.0, 1.0)
         require_range("commands.waist_damping_s", self.waist_damping_s, 0.0, 0.2)
         require_range("commands.step_correct_s", self.step_correct_s, 0.0, 1.0)

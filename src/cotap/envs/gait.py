@@ -68,11 +68,15 @@ class StepMotion:
         clear_m: Sideways distance of two soles below which the swinging one gives way; 0 for never.
         hold_back_m: By how much less the swinging foot reaches to where the torso leans, per sine of its tilt.
         catch_lift: By what share of itself the lift grows under a torso that leans far.
+        roll_damping_s: How far joints that roll are sent against their velocity [s].
+        twist_damping_s: The same of joints that turn about the vertical [s].
+        straighten_rad: By how much less than in the default pose knees are bent [rad].
     """
 
     def __init__(
         self, spec: RobotSpec, model: mujoco.MjModel, period_s: float, lift: float = 1.0, stride: float = 1.0,
         apart_m: float = 0.0, clear_m: float = 0.0, hold_back_m: float = 0.0, catch_lift: float = 0.0,
+        roll_damping_s: float = 0.0, twist_damping_s: float = 0.0, straighten_rad: float = 0.0,
     ) -> None:  # fmt: skip
         chains = [spec.chain(foot.body, spec.base_body) for foot in spec.feet]
         names = [[b.joint or "" for b in chain] for chain in chains]
@@ -82,6 +86,10 @@ class StepMotion:
         for i, foot in enumerate(spec.feet):
             for joint, angle in foot.flexion:
                 self._lift[i, names[i].index(joint)] = lift * angle
+        axes = [[spec.joints[i].axis for i in chain] for chain in self.joints.tolist()]
+        damping = {(1.0, 0.0, 0.0): roll_damping_s, (0.0, 0.0, 1.0): twist_damping_s}
+        self._damping = torch.tensor([[damping.get(axis, 0.0) for axis in chain] for chain in axes])
+        """(F, n) [s]."""
         kinematics = [_sole_kinematics(spec, model, i, names[i]) for i in range(len(spec.feet))]
         maps, outward, lateral = zip(*kinematics, strict=True)
         # Half of the way that the ground moves during a stance, per unit of velocity.
@@ -90,7 +98,11 @@ class StepMotion:
         self._hold_back, self._catch_lift = hold_back_m, catch_lift
         self._lateral = torch.tensor(lateral)
         self._outward = torch.stack(outward)
-        self._apart, self._clear = 0.5 * apart_m * self._outward, clear_m
+        self._clear = clear_m
+        self._pose = 0.5 * apart_m * self._outward
+        """Offsets (F, n) [rad] of the pose that is stepped from."""
+        for i, (_, knee, *_) in enumerate(spec.stance.joints):
+            self._pose[i, names[i].index(knee)] -= straighten_rad
         self._chains = chains_between(spec, spec.base_body, [(foot.body, foot.sole) for foot in spec.feet])
 
     def __call__(self, phase: torch.Tensor, velocity_h: torch.Tensor, yaw_rate: torch.Tensor) -> torch.Tensor:
@@ -100,12 +112,16 @@ class StepMotion:
         forward = velocity_h[:, :1] - yaw_rate.unsqueeze(1) * self._lateral
         rates = torch.stack((forward, velocity_h[:, 1:].expand(-1, feet), yaw_rate.unsqueeze(1).expand(-1, feet)), 2)
         stride = (self._per_velocity * rates.unsqueeze(2)).sum(3)
-        return self._apart + self._lifting(phase) + sweep(phase, feet).unsqueeze(2) * stride
+        return self._pose + self._lifting(phase) + sweep(phase, feet).unsqueeze(2) * stride
 
     def _lifting(self, phase: torch.Tensor) -> torch.Tensor:
         """Offsets (N, F, n) [rad] that lift the swinging foot."""
         bump = torch.sin(torch.pi * swing_progress(phase, self.joints.shape[0])).square()
         return bump.unsqueeze(2) * self._lift
+
+    def damping(self, joint_vel: torch.Tensor) -> torch.Tensor:
+        """Offsets (N, F, n) [rad] against joint velocities (N, J) [rad/s]."""
+        return -self._damping * joint_vel[:, self.joints]
 
     def catching(self, phase: torch.Tensor, projected_gravity: torch.Tensor) -> torch.Tensor:
         """Offsets (N, F, n) [rad] that lift the swinging foot higher under a torso that leans far, so that what
