@@ -199,7 +199,10 @@ def test_a_policy_that_was_trained_with_another_gait_runs_and_says_so(free_port,
         server.stop()
     ((title, text),) = told
     assert title == "robot B: another gait"
-    names = ("step_apart_m", "step_clear_m", "step_hold_back_m", "step_catch_lift", "waist_yield_s", "waist_damping_s")
+    names = (
+        "step_apart_m", "step_clear_m", "step_hold_back_m", "step_catch_lift", "step_roll_damping_s",
+        "step_twist_damping_s", "step_straighten_rad", "waist_yield_s", "waist_damping_s", "step_correct_s",
+    )  # fmt: skip
     differ = [f"{name} 0.0 (here {getattr(app.session.env.cfg.commands, name)})" for name in names]
     assert text == f"facet was trained with {', '.join(differ)}"
     assert app.session.num_steps == 3
