@@ -39,6 +39,13 @@ def make_controller(policy, spec, laws: UpperBodyConfig | None = None, seed: int
     return Controller(policy, spec, laws or UpperBodyConfig(), CommandConfig(steady_rad=0.2), motion, seed)
 
 
+def test_a_controller_corrects_jumps_of_the_clock_for_as_long_as_it_was_trained_to(policy, spec):
+    commands = CommandConfig(step_timing=True, step_correct_s=0.1)
+    controller = Controller(policy, spec, UpperBodyConfig(), commands, ArmMotion().reference(spec, 0.02), seed=0)
+    assert controller._timing is not None
+    assert controller._timing._correct_s == 0.1
+
+
 @pytest.fixture
 def default(spec):
     return np.array([j.default_rad for j in spec.joints])

@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 import torch
 
+from cotap.envs.actions import ActionConfig, JointTargets
+from cotap.envs.commands import Command, CommandConfig
 from cotap.envs.gait import StepMotion, desired_contact, sweep, swing_progress
 from cotap.envs.symmetry import joint_reflection
 
@@ -50,6 +52,14 @@ def sole(spec, model, joints, foot):
     return data.xpos[body] + rotation @ spec.feet[foot].sole, rotation
 
 
+def offset_by(spec, motion: StepMotion, offsets: torch.Tensor, feet=(0, 1)) -> np.ndarray:
+    """The default pose (J,) with the offsets (F, n) of these feet."""
+    joints = np.array([j.default_rad for j in spec.joints])
+    for foot in feet:
+        joints[motion.joints[foot].numpy()] += offsets[foot].numpy()
+    return joints
+
+
 @pytest.mark.parametrize("foot", [0, 1])
 @pytest.mark.parametrize(
     ("velocity", "yaw_rate"), [((0.2, 0.0), 0.0), ((0.0, 0.1), 0.0), ((0.0, 0.0), 0.2), ((-0.2, 0.05), -0.2)]
@@ -73,10 +83,7 @@ def test_soles_move_under_the_body_as_the_ground_would(spec, model, velocity, ya
 def test_feet_are_put_apart_by_what_is_asked(spec, model):
     motion = StepMotion(spec, model, PERIOD, lift=0.0, stride=0.0, apart_m=0.06)
     offsets = motion(torch.tensor([0.3]), torch.zeros(1, 2), torch.zeros(1))[0]
-    default = np.array([j.default_rad for j in spec.joints])
-    joints = default.copy()
-    for foot in range(2):
-        joints[motion.joints[foot].numpy()] += offsets[foot].numpy()
+    default, joints = np.array([j.default_rad for j in spec.joints]), offset_by(spec, motion, offsets)
     for foot, outward in ((0, 1.0), (1, -1.0)):
         (was, _), (now, rotation) = sole(spec, model, default, foot), sole(spec, model, joints, foot)
         assert now[1] - was[1] == pytest.approx(0.03 * outward, abs=1e-3)
@@ -191,13 +198,29 @@ def test_legs_damp_rolling_and_twisting_joints_and_no_other(spec, model):
     assert not StepMotion(spec, model, PERIOD).damping(velocity).any()
 
 
+def test_targets_are_damped_and_straightened_while_walking_only(spec, model):
+    """Joint by joint, one world that walks and one that stands, both with legs at 2 rad/s."""
+    given = {"step_roll_damping_s": 0.02, "step_twist_damping_s": 0.01, "step_straighten_rad": 0.03}
+    stand = torch.tensor([0.0, 1.0])
+    command = Command(torch.zeros(2, 2), torch.zeros(2), stand, torch.full((2,), 1.02), torch.full((2,), 0.3))
+    gravity, zeros = torch.tensor([[0.0, 0.0, -1.0]]).expand(2, -1), torch.zeros(2, len(spec.joints))
+
+    def targets(**commands: float) -> torch.Tensor:
+        make = JointTargets(ActionConfig(), spec, model, CommandConfig(**commands))
+        joints = make.default.expand(2, -1)
+        return make(zeros, command, joints, zeros + 2.0, gravity, torch.zeros(2, 3), torch.zeros(2, 8))
+
+    walking, standing = targets(**given) - targets()
+    moved = {"hip_roll": -0.04, "hip_yaw": -0.02, "knee": -0.03}
+    expected = [moved.get(name.removeprefix("left_").removeprefix("right_"), 0.0) for name in spec.joint_names]
+    torch.testing.assert_close(walking, torch.tensor(expected), atol=1e-6, rtol=0)
+    assert not standing.any()
+
+
 def test_knees_that_are_straightened_put_soles_further_down(spec, model):
     motion = StepMotion(spec, model, PERIOD, lift=0.0, stride=0.0, straighten_rad=0.03)
     offsets = motion(torch.tensor([0.3]), torch.zeros(1, 2), torch.zeros(1))[0]
-    default = np.array([j.default_rad for j in spec.joints])
-    joints = default.copy()
-    for foot in range(2):
-        joints[motion.joints[foot].numpy()] += offsets[foot].numpy()
+    default, joints = np.array([j.default_rad for j in spec.joints]), offset_by(spec, motion, offsets)
     bent_less = dict(zip(spec.joint_names, default - joints, strict=True))
     assert {name: angle for name, angle in bent_less.items() if angle} == pytest.approx(
         {"left_knee": 0.03, "right_knee": 0.03}

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from cotap.checks import require_finite, require_range
+from cotap.checks import reason_of, require_finite, require_range
 from cotap.evaluation.disturbance import response_measures, window_measures
 from cotap.evaluation.metrics import summarize, tracking_measures
 from cotap.evaluation.rollout import STEPPED, Trajectory
@@ -88,7 +88,7 @@ def load_recording(path: Path | str) -> Recording:
     except OSError as error:
         raise RecordingError(f"recording {str(path)!r} cannot be read from disk: {error}") from error
     except Exception as error:  # zip, zlib, numpy and JSON each fail in ways of their own on rubbish
-        raise RecordingError(f"{str(path)!r} is not a cotap recording, or is truncated: {error}") from error
+        raise RecordingError(f"{str(path)!r} is not a cotap recording, or is truncated: {reason_of(error)}") from error
     if kind != FORMAT or version != VERSION:
         raise RecordingError(f"{str(path)!r} is a {kind!r} of version {version!r}; this cotap reads {FORMAT} {VERSION}")
     try:

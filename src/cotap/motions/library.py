@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from cotap.checks import reason_of
 from cotap.files import write_atomically
 from cotap.robots import RobotSpec
 
@@ -183,7 +184,7 @@ def read_npz(path: str | Path) -> dict[str, np.ndarray]:
     except MotionError:
         raise
     except Exception as error:  # zip, zlib and numpy each fail in ways of their own on rubbish
-        raise MotionError(f"{str(path)!r} is damaged or no npz file of plain numbers: {error}") from error
+        raise MotionError(f"{str(path)!r} is damaged or no npz file of plain numbers: {reason_of(error)}") from error
 
 
 def shipped_library(spec: RobotSpec) -> MotionLibrary:
