@@ -16,6 +16,7 @@ from cotap.deployment.joint_law import JointLaw, pd_law
 from cotap.deployment.metadata import PolicyError, PolicyMetadata
 from cotap.deployment.policy import OnnxPolicy, arm_advance
 from cotap.envs.commands import CommandConfig, CommandSource, leaning
+from cotap.envs.foresight import Foresight
 from cotap.envs.observations import ObservationHistory, actor_terms, actor_values
 from cotap.envs.reference import ReferenceMotion
 from cotap.envs.state import RobotState
@@ -119,6 +120,7 @@ class Controller:
         self._rng = torch.Generator().manual_seed(seed)
         self._everyone = torch.ones(1, dtype=torch.bool)
         self.commands = CommandSource(commands, 1, spec.nominal_height_m, self.dt)
+        self._foresight = Foresight(spec) if commands.foresee_falls else None
         self._timing = StepTiming(spec, 1, self.dt, commands.step_correct_s) if commands.step_timing else None
         self.motion = motion
         self.upper_body = UpperBody(laws, spec, 1, self.dt, torch.float64)
@@ -155,6 +157,8 @@ class Controller:
         if self._started:
             turning = s.torso_angular_velocity_t
             lean, command = leaning(s.projected_gravity_t, turning), self.commands.current()
+            if self._foresight:
+                lean = self._foresight.lean(lean, s, command)
             catch = self._timing.step(s, command, lean > self.commands.cfg.steady_rad) if self._timing else None
             self.commands.step(self._rng, lean.float(), turning[:, 2].float(), catch)
             self.upper_body.step(self.dt, self._rng)

@@ -68,6 +68,9 @@ class CommandConfig:
     waist_damping_s: float = 0.0
     """How far the waist turns against the torso, per rad/s by which it turns faster than it should [s]; fading up to
     1 rad/s. From 0.1 s on control delay makes it shake instead."""
+    foresee_falls: bool = False
+    """Whether a standing robot steps as soon as its joints and IMU tell that it will fall (`Foresight`), instead of
+    from `steady_rad` on."""
     step_timing: bool = False
     """Whether the gait clock jumps to where a robot that was struck catches itself (`StepTiming`)."""
     step_correct_s: float = 0.0

@@ -29,6 +29,7 @@ from cotap.envs.blows import BlowConfig, Blows
 from cotap.envs.commands import CommandConfig, CommandSource, leaning
 from cotap.envs.disturbances import Assistance, AssistConfig, HandForceConfig, HandForces, assist_wrench
 from cotap.envs.forces import ForceProfile, ScriptedForces
+from cotap.envs.foresight import Foresight
 from cotap.envs.gait import desired_contact, swing_progress
 from cotap.envs.impedance import ImpedanceConfig, PathFollower
 from cotap.envs.observations import (
@@ -204,6 +205,7 @@ class H1Env(VecEnv):
         self._weight_n = float(model.body_mass.sum()) * GRAVITY
 
         self.commands = CommandSource(cfg.commands, n, spec.nominal_height_m, self.dt)
+        self.foresight = Foresight(spec) if cfg.commands.foresee_falls else None
         self.step_timing = (
             StepTiming(spec, n, self.dt, cfg.commands.step_correct_s) if cfg.commands.step_timing else None
         )
@@ -325,8 +327,10 @@ class H1Env(VecEnv):
         self.episode_length_buf += 1
         s = self.state
         turning = s.torso_angular_velocity_t
-        lean = leaning(s.projected_gravity_t, turning)
         timing, command = self.step_timing, self.commands.current()
+        lean = leaning(s.projected_gravity_t, turning)
+        if self.foresight:
+            lean = self.foresight.lean(lean, s, command)
         catch = timing.step(s, command, lean > self.commands.cfg.steady_rad) if timing else None
         self.commands.step(self.rng, lean, turning[:, 2], catch)
         self._follow_path()
