@@ -46,6 +46,24 @@ def test_a_controller_corrects_jumps_of_the_clock_for_as_long_as_it_was_trained_
     assert controller._timing._correct_s == 0.1
 
 
+@pytest.mark.parametrize("falls", [True, False])
+def test_a_controller_steps_where_a_fall_is_foreseen(policy, spec, falls, monkeypatch):
+    """From what its sensors read alone: all else of the state is NaN."""
+    commands = CommandConfig(foresee_falls=True, stand_probability=1.0)
+    motion = ArmMotion().reference(spec, 0.02)
+    controller = Controller(policy, spec, UpperBodyConfig(), commands, motion, seed=0)
+    robot = make_robot(spec)
+    start_up(robot, controller, SafetyConfig(ramp_s=0.0), 0)
+    felt, foresight = [], controller._foresight
+    assert foresight is not None
+    real = foresight.falling
+    monkeypatch.setattr(foresight, "falling", lambda s, c: felt.append(real(s, c)) or torch.tensor([falls]))
+    controller.step(robot.read())
+    controller.step(robot.read())
+    assert felt and not any(f.any() for f in felt)  # it stands, and well
+    assert (controller.commands.current().stand[0] < 0.5) == falls
+
+
 @pytest.fixture
 def default(spec):
     return np.array([j.default_rad for j in spec.joints])
