@@ -110,6 +110,9 @@ def fit(options: argparse.Namespace) -> int:
     kept = world % 8 == 0
     near, far = until_s <= AHEAD_S, until_s > SAFE_S
     pools = [(mask & ~kept).nonzero()[:, 0] for mask in (near, far)]
+    for what, pool in zip(("that are about to fall", f"that stand for {SAFE_S:g} s more"), pools, strict=True):
+        if len(pool) == 0:
+            raise SystemExit(f"there are no robots {what} in {', '.join(map(str, options.recordings))}: record more")
     reflection = feature_reflection(ROBOTS["h1"]())
     # Learned in units of what usually happens, the same left and right.
     power = x.square().mean(0, keepdim=True)
@@ -178,6 +181,10 @@ def main() -> int:
     learn.add_argument("--output", type=Path, default=Path(foresight.__file__).with_suffix(".npz"))
     learn.set_defaults(run=fit)
     options = parser.parse_args()
+    if getattr(options, "seconds", math.inf) <= SAFE_S:
+        parser.error(
+            f"--seconds {options.seconds:g} must be more than {SAFE_S:g}: of the last ones nobody knows what comes"
+        )
     return options.run(options)
 
 

@@ -127,6 +127,20 @@ def test_recordings_and_weights_are_written_and_read(tmp_path: Path, monkeypatch
     assert "taken for falls" in capsys.readouterr().out
 
 
+def test_recordings_of_which_nothing_can_be_learned_are_told(tmp_path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    output = str(tmp_path / "weights.npz")
+    monkeypatch.setattr(sys, "argv", ["", "collect", "--seconds", "2", "--output", output])
+    with pytest.raises(SystemExit):
+        fit_foresight.main()
+    assert "--seconds 2 must be more than 2.4" in capsys.readouterr().err
+    nobody_fell = {"seen": np.zeros((9, 47), np.float16), "until_s": np.full(9, 1e3), "world": np.arange(9)}
+    np.savez(tmp_path / "calm.npz", **nobody_fell)
+    monkeypatch.setattr(sys, "argv", ["", "fit", str(tmp_path / "calm.npz"), "--output", output])
+    with pytest.raises(SystemExit, match="no robots that are about to fall"):
+        fit_foresight.main()
+    assert not Path(output).exists()
+
+
 @pytest.mark.slow
 def test_falls_are_seen_a_second_ahead_and_few_that_are_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The shipped weights on robots that were not recorded for them."""
