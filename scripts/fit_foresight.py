@@ -18,11 +18,11 @@ import torch
 from cotap.agents.actors import as_dict
 from cotap.envs import H1Env, foresight
 from cotap.envs.foresight import AHEAD_S, SURE, StandingRisk
+from cotap.envs.judgement import save_arrays, save_weights
 from cotap.envs.step_timing import feature_reflection, features
 from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.policy import find_checkpoint, load_policy
 from cotap.evaluation.protocols import VelocityTracking
-from cotap.files import write_atomically
 from cotap.robots import ROBOTS
 
 SAFE_S = 2.4
@@ -54,7 +54,7 @@ def collect(options: argparse.Namespace) -> int:
     kept[torch.arange(len(s)) % EVERY > 0] = False
     world = torch.arange(env.num_envs).expand(len(s), -1)
     arrays = {"seen": x[kept].numpy(), "until_s": until_s[kept].numpy(), "world": world[kept].numpy()}
-    write_atomically(options.output, lambda path: _save(path, arrays))
+    save_arrays(arrays, options.output)
     print(f"{int(f.any(0).sum())} of {env.num_envs} worlds fell in {options.seconds:g} s; wrote {options.output}")
     return 0
 
@@ -135,8 +135,7 @@ def fit(options: argparse.Namespace) -> int:
     _report(logit, until_s[kept], world[kept])
     with torch.no_grad():
         model.net[0].weight /= scale  # pyright: ignore[reportIndexIssue, reportArgumentType]
-    weights = {k: v.half().numpy() for k, v in model.net.state_dict().items()}
-    write_atomically(options.output, lambda path: _save(path, weights))
+    save_weights(model.net, options.output)
     print(f"wrote {options.output}")
     return 0
 
@@ -151,11 +150,6 @@ def _report(logit: torch.Tensor, until_s: torch.Tensor, world: torch.Tensor) -> 
         highest = torch.full((len(worlds),), -math.inf).scatter_reduce(0, place, logit[rows], "amax")
         caught = (highest > SURE).float().mean()
         print(f"of {len(worlds)} worlds that fall {start:g} to {start + 0.3:g} s later {caught:.1%} are")
-
-
-def _save(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    with path.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
 def main() -> int:

@@ -17,10 +17,10 @@ import torch
 from cotap.agents.actors import as_dict
 from cotap.envs import H1Env, step_timing
 from cotap.envs.commands import STEADY_RAD, Catch, Command
+from cotap.envs.judgement import save_arrays, save_weights
 from cotap.envs.state import RobotState
 from cotap.envs.step_timing import BINS, FallRisk, feature_reflection, features, risk_at
 from cotap.evaluation.policy import find_checkpoint, load_policy
-from cotap.files import write_atomically
 from cotap.robots import ROBOTS
 
 WATCH_S = 2.2
@@ -118,7 +118,7 @@ def collect(options: argparse.Namespace) -> int:
             count += int(mask.sum())
     data = {"seen": torch.cat(seen), "choice": torch.cat(choice), "fell": torch.cat(fell)}
     arrays = {k: v.numpy() for k, v in data.items()}
-    write_atomically(options.output, lambda path: _save(path, arrays))
+    save_arrays(arrays, options.output)
     print(f"{count} trials, {data['fell'].mean():.1%} fell; wrote {options.output}")
     return 0
 
@@ -163,15 +163,9 @@ def fit(options: argparse.Namespace) -> int:
         risk = model(x[kept]).sigmoid()
         went_on, chosen = risk_at(risk, choice[kept].clamp_min(0.0)), risk[:, :BINS].amin(1)
         print(f"expected falls: as the clock was set {went_on.mean():.3f}, at its best {chosen.mean():.3f}")
-    weights = {k: v.half().numpy() for k, v in model.net.state_dict().items()}
-    write_atomically(options.output, lambda path: _save(path, weights))
+    save_weights(model.net, options.output)
     print(f"wrote {options.output}")
     return 0
-
-
-def _save(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    with path.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
 def main() -> int:

@@ -6,16 +6,13 @@ IMU together tell it a second ahead.
 
 from __future__ import annotations
 
-import io
 import math
-from importlib import resources
-from itertools import pairwise
 
-import numpy as np
 import torch
 from torch import nn
 
 from cotap.envs.commands import Command
+from cotap.envs.judgement import load_shipped, perceptron
 from cotap.envs.state import RobotState
 from cotap.envs.step_timing import feature_reflection, features
 from cotap.reflection import Reflection
@@ -28,7 +25,6 @@ SURE = 3.0
 """Logit from which a robot is taken to fall: a step that was not needed costs less than a fall, but costs."""
 FAR_RAD = 0.3
 """Lean from which a standing robot steps whatever is foreseen: nothing of the kind stood on where this was learned."""
-_WEIGHTS = "foresight.npz"
 
 
 class StandingRisk(nn.Module):
@@ -40,11 +36,7 @@ class StandingRisk(nn.Module):
     def __init__(self, reflection: Reflection) -> None:
         super().__init__()
         self._reflection = reflection
-        widths = (reflection.index.numel(), *HIDDEN)
-        layers: list[nn.Module] = []
-        for before, after in pairwise(widths):
-            layers += (nn.Linear(before, after), nn.ELU())
-        self.net = nn.Sequential(*layers, nn.Linear(widths[-1], 1))
+        self.net = perceptron(reflection.index.numel(), *HIDDEN, 1)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Logits (N,)."""
@@ -65,13 +57,7 @@ class Foresight:
     def __init__(self, spec: RobotSpec) -> None:
         self._default = torch.tensor([j.default_rad for j in spec.joints])
         self.model = StandingRisk(feature_reflection(spec)).eval()
-        stored = resources.files("cotap.envs").joinpath(_WEIGHTS).read_bytes()
-        with np.load(io.BytesIO(stored), allow_pickle=False) as weights:
-            state = {k: torch.tensor(weights[k].astype(np.float32)) for k in weights.files}
-        try:
-            self.model.net.load_state_dict(state, assign=True)
-        except RuntimeError as error:
-            raise ValueError(f"foresight was fitted for another robot than {spec.name!r}: {error}") from error
+        load_shipped(self.model.net, "foresight.npz", "foresight", spec)
 
     @torch.no_grad()
     def falling(self, s: RobotState, command: Command) -> torch.Tensor:

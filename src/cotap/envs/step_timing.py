@@ -6,17 +6,14 @@ is judged here, from joints and IMU alone, lets the clock jump to where a robot 
 
 from __future__ import annotations
 
-import io
 import math
-from importlib import resources
-from itertools import pairwise
 from typing import Any
 
-import numpy as np
 import torch
 from torch import nn
 
 from cotap.envs.commands import Catch, Command
+from cotap.envs.judgement import load_shipped, perceptron
 from cotap.envs.persistence import Stateful
 from cotap.envs.state import RobotState
 from cotap.envs.symmetry import joint_reflection
@@ -26,7 +23,6 @@ from cotap.robots import RobotSpec
 BINS = 24
 """Points of the stride that are told apart; an even number, so that a mirror image is one of them."""
 HIDDEN = (128, 64)
-_WEIGHTS = "step_timing.npz"
 
 
 class FallRisk(nn.Module):
@@ -38,11 +34,7 @@ class FallRisk(nn.Module):
     def __init__(self, reflection: Reflection) -> None:
         super().__init__()
         self._reflection = reflection
-        widths = (reflection.index.numel(), *HIDDEN)
-        layers: list[nn.Module] = []
-        for before, after in pairwise(widths):
-            layers += (nn.Linear(before, after), nn.ELU())
-        self.net = nn.Sequential(*layers, nn.Linear(widths[-1], BINS + 1))
+        self.net = perceptron(reflection.index.numel(), *HIDDEN, BINS + 1)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Logits (N, BINS + 1)."""
@@ -85,13 +77,7 @@ class StepTiming(Stateful):
         self._since_first_s = torch.full((num_envs,), math.inf)
         """Since it jumped and was not correcting a jump."""
         self.model = FallRisk(feature_reflection(spec)).eval()
-        stored = resources.files("cotap.envs").joinpath(_WEIGHTS).read_bytes()
-        with np.load(io.BytesIO(stored), allow_pickle=False) as weights:
-            state = {k: torch.tensor(weights[k].astype(np.float32)) for k in weights.files}
-        try:
-            self.model.net.load_state_dict(state, assign=True)
-        except RuntimeError as error:
-            raise ValueError(f"step timing was fitted for another robot than {spec.name!r}: {error}") from error
+        load_shipped(self.model.net, "step_timing.npz", "step timing", spec)
 
     def reset(self, mask: torch.Tensor) -> None:
         """Worlds in `mask` (N,) start anew."""
