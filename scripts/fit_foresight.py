@@ -18,11 +18,12 @@ import torch
 from cotap.agents.actors import as_dict
 from cotap.envs import H1Env, foresight
 from cotap.envs.foresight import AHEAD_S, SURE, StandingRisk
-from cotap.envs.judgement import save_arrays, save_weights
+from cotap.envs.judgement import save_weights
 from cotap.envs.step_timing import feature_reflection, features
 from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.policy import find_checkpoint, load_policy
 from cotap.evaluation.protocols import VelocityTracking
+from cotap.files import write_arrays
 from cotap.robots import ROBOTS
 
 SAFE_S = 2.4
@@ -54,7 +55,7 @@ def collect(options: argparse.Namespace) -> int:
     kept[torch.arange(len(s)) % EVERY > 0] = False
     world = torch.arange(env.num_envs).expand(len(s), -1)
     arrays = {"seen": x[kept].numpy(), "until_s": until_s[kept].numpy(), "world": world[kept].numpy()}
-    save_arrays(arrays, options.output)
+    write_arrays(options.output, arrays)
     print(f"{int(f.any(0).sum())} of {env.num_envs} worlds fell in {options.seconds:g} s; wrote {options.output}")
     return 0
 

@@ -17,10 +17,11 @@ import torch
 from cotap.agents.actors import as_dict
 from cotap.envs import H1Env, step_timing
 from cotap.envs.commands import STEADY_RAD, Catch, Command
-from cotap.envs.judgement import save_arrays, save_weights
+from cotap.envs.judgement import save_weights
 from cotap.envs.state import RobotState
 from cotap.envs.step_timing import BINS, FallRisk, feature_reflection, features, risk_at
 from cotap.evaluation.policy import find_checkpoint, load_policy
+from cotap.files import write_arrays
 from cotap.robots import ROBOTS
 
 WATCH_S = 2.2
@@ -118,7 +119,7 @@ def collect(options: argparse.Namespace) -> int:
             count += int(mask.sum())
     data = {"seen": torch.cat(seen), "choice": torch.cat(choice), "fell": torch.cat(fell)}
     arrays = {k: v.numpy() for k, v in data.items()}
-    save_arrays(arrays, options.output)
+    write_arrays(options.output, arrays)
     print(f"{count} trials, {data['fell'].mean():.1%} fell; wrote {options.output}")
     return 0
 

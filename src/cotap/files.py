@@ -5,8 +5,10 @@ from __future__ import annotations
 import contextlib
 import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+
+import numpy as np
 
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
@@ -30,6 +32,16 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
             temporary.unlink()
         raise
     _sync_folder(path.parent)
+
+
+def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write a compressed npz without objects, whole or not at all. Raises OSError as `write_atomically` does."""
+
+    def write(temporary: Path) -> None:
+        with temporary.open("wb") as file:  # numpy would add .npz to a name
+            np.savez_compressed(file, allow_pickle=False, **arrays)
+
+    write_atomically(path, write)
 
 
 def require_output(option: str, path: Path | str, suffixes: tuple[str, ...] = ()) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
 from importlib import resources
 from itertools import pairwise
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from cotap.files import write_atomically
+from cotap.files import write_arrays
 from cotap.robots import RobotSpec
 
 
@@ -47,14 +46,4 @@ def load_shipped(net: nn.Module, file: str, what: str, spec: RobotSpec) -> None:
 
 def save_weights(net: nn.Module, path: Path) -> None:
     """Write weights as they are shipped, in half precision, whole or not at all."""
-    save_arrays({k: v.half().numpy() for k, v in net.state_dict().items()}, path)
-
-
-def save_arrays(arrays: Mapping[str, np.ndarray], path: Path) -> None:
-    """Write a compressed npz, whole or not at all."""
-
-    def save(temporary: Path) -> None:
-        with temporary.open("wb") as file:
-            np.savez_compressed(file, allow_pickle=False, **arrays)
-
-    write_atomically(path, save)
+    write_arrays(path, {k: v.half().numpy() for k, v in net.state_dict().items()})

@@ -17,7 +17,7 @@ from cotap.checks import reason_of, require_finite, require_range
 from cotap.evaluation.disturbance import response_measures, window_measures
 from cotap.evaluation.metrics import summarize, tracking_measures
 from cotap.evaluation.rollout import STEPPED, Trajectory
-from cotap.files import write_atomically
+from cotap.files import write_arrays
 
 FORMAT, VERSION = "cotap-recording", 1
 SCENE: dict[str, tuple[str | int, ...]] = {
@@ -63,12 +63,7 @@ class Recording:
         arrays = {f"trajectory.{name}": getattr(self.trajectory, name) for name in ("dt", *STEPPED)}
         arrays |= {f"scene.{name}": value for name, value in self.scene.items()}
         arrays["head"] = json.dumps({"format": FORMAT, "version": VERSION, "settings": self.settings})
-
-        def write(temporary: Path) -> None:
-            with temporary.open("wb") as file:
-                np.savez_compressed(file, allow_pickle=False, **{k: np.asarray(v) for k, v in arrays.items()})
-
-        write_atomically(path, write)
+        write_arrays(path, {k: np.asarray(v) for k, v in arrays.items()})
 
 
 def load_recording(path: Path | str) -> Recording:

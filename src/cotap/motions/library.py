@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from cotap.checks import reason_of
-from cotap.files import write_atomically
+from cotap.files import write_arrays
 from cotap.robots import RobotSpec
 
 FPS = 50.0
@@ -118,12 +118,7 @@ class MotionLibrary:
             "arms": np.concatenate([c.arms for c in self.clips]).astype(np.float32),
             "root": np.concatenate([c.root for c in self.clips]).astype(np.float32),
         }
-
-        def write(temporary: Path) -> None:
-            with temporary.open("wb") as file:
-                np.savez_compressed(file, allow_pickle=False, **arrays)
-
-        write_atomically(Path(path), write)
+        write_arrays(Path(path), arrays)
 
     @classmethod
     def load(cls, path: str | Path, spec: RobotSpec) -> MotionLibrary:
