@@ -620,7 +620,19 @@ def test_a_recipe_that_goes_on_changes_the_checkpoints_config(monkeypatch: pytes
     assert options.training == expected
     assert options.training.ppo.hidden == kept.ppo.hidden
     assert options.training.env.blows.enabled
+    assert options.training.env.hand_forces.enabled
     assert not kept.env.blows.enabled
+
+
+def test_robust_walks_as_well_and_takes_blows_and_loads():
+    walk, robust = (CONTINUATIONS[name](BASE_RECIPES["default"]()) for name in ("walk", "robust"))
+    assert not walk.env.blows.enabled
+    assert not walk.env.hand_forces.enabled
+    assert robust.env.blows.enabled
+    assert robust.env.hand_forces.enabled
+    assert walk.env.collision == robust.env.collision == "full"
+    assert walk.env.rewards == robust.env.rewards
+    assert walk.ppo == robust.ppo
 
 
 def test_feet_that_are_further_apart_than_a_recipe_asks_stay_so():

@@ -47,9 +47,9 @@ class BaseOptions:
     """Checkpoint to go on from, a file or the name of a shipped one; its config is the default for every option. auto:
     the newest in --run-dir, if any. A distilled policy begins a new run, with its arms back under PD."""
     recipe: str = "default"
-    """default (from nothing to walking); paper (the same with the paper's networks); robust (blows and loads on the
-    hands: with --resume, what a policy that walks learns next, from nothing without it); or facet (FACET's tracking
-    reward)."""
+    """default (from nothing to walking); paper (the same with the paper's networks); walk (to walk and stand well, arms
+    moving) and robust (that, and blows and loads on the hands): with --resume, what a policy that walks learns next,
+    from nothing without it; or facet (FACET's tracking reward)."""
     command: tyro.conf.Suppress[str] = ""
     training: Annotated[BaseTraining, tyro.conf.arg(name="")] = field(default_factory=BASE_RECIPES["default"])
 

@@ -205,6 +205,17 @@ def test_layout_that_differs_is_named_with_both_values():
         require_layout("c.pt", {k: v for k, v in present.items() if k != "history"}, present)
 
 
+def test_tables_of_a_layout_agree_in_what_the_environment_names():
+    present = {"actions": {"scale": 0.25, "clip": 20.0}}
+    require_layout("c.pt", {"actions": {"scale": 0.25, "clip": 20.0, "lead": 0.03}}, present)
+    with pytest.raises(CheckpointError, match=r"another actions: \{'scale': 0.5, 'clip': 20.0, 'lead': 0.03\}, here"):
+        require_layout("c.pt", {"actions": {"scale": 0.5, "clip": 20.0, "lead": 0.03}}, present)
+    with pytest.raises(CheckpointError, match=r"another actions: \{'scale': 0.25\}, here"):
+        require_layout("c.pt", {"actions": {"scale": 0.25}}, present)
+    with pytest.raises(CheckpointError, match=r"another actions: 0.25, here"):
+        require_layout("c.pt", {"actions": 0.25}, present)
+
+
 FULL = {
     "torch": RuntimeError("[enforce fail at inline_container.cc:664] . unexpected pos 4096 vs 4000"),
     "system": OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)),

@@ -98,6 +98,7 @@ BEST = {
     "track_yaw_rate_closely": 1.0,
     "track_height": 1.0, "track_height_widely": 1.0, "contact_schedule": 1.0, "alive": 1.0, "track_arms": 1.0,
     "stay_close": 1.0, "track_key_points": 1.0, "track_key_velocities": 1.0, "track_hands_as_facet": 1.0,
+    "steady_torso": 1.0,
 }  # fmt: skip
 ALL_TERMS = sorted({f.name for group in (LowerRewards, UpperRewards) for f in dataclasses.fields(group)})
 
@@ -169,6 +170,7 @@ CASES = [
     # One hand, one elbow: FACET judges the hand.
     ("track_hands_as_facet", {"key_points_t": [[[0.2, 0.2, 0.4], [9.0, -0.1, 0.1]]]}, math.exp(-0.09)),
     ("track_hands_as_facet", {"key_velocities_t": [[[0.5, 0, 0], [0, -1.0, 0]]]}, math.exp(-0.25)),
+    ("steady_torso", {"yaw_rate": [0.3]}, math.exp(-0.01 / 0.06)),
     ("arm_residual", {"action": [[9.0, 9.0, 9.0, 1.0, -2.0]]}, 5.0),
 ]  # fmt: skip
 

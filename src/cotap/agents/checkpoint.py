@@ -117,9 +117,15 @@ def require_parts(path: Path | str, content: dict[str, Any], parts: Collection[s
 
 
 def require_layout(path: Path | str, saved: dict[str, Any], present: dict[str, Any]) -> None:
-    """Raise CheckpointError naming the first entry in which a checkpoint's layout differs from the environment's."""
+    """Raise CheckpointError naming the first entry in which a checkpoint's layout differs from the environment's.
+
+    What the environment does not name, in the layout or in a table in it, may be anything.
+    """
     for key, value in present.items():
-        if not same(saved.get(key), value):
+        kept = saved.get(key)
+        if isinstance(kept, dict) and isinstance(value, dict):
+            kept = {name: entry for name, entry in kept.items() if name in value}
+        if not same(kept, value):
             raise CheckpointError(
                 f"checkpoint {str(path)!r} was trained with another {key}: {saved.get(key)!r}, here {value!r}"
             )

@@ -268,13 +268,16 @@ class H1Env(VecEnv):
     def layout(self) -> dict[str, Any]:
         """What a policy must agree with: robot, joints, observation terms, action convention."""
         c = self.cfg
+        actions = asdict(c.actions)
+        # How far ahead the arms' targets run is theirs, and no part of what an action means.
+        del actions["reference_lead_s"]
         return {
             "robot": self.spec.name,
             "joints": list(self.spec.joint_names),
             "terms": [list(t) for t in self.history.terms],
             "history": self.history.steps,
             "critic_terms": [list(t) for t in self._critic_terms],
-            "actions": asdict(c.actions),
+            "actions": actions,
             "control_dt": c.control_dt,
         }
 

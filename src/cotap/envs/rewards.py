@@ -102,6 +102,7 @@ class UpperRewards:
     track_key_points: float = 1.0
     track_key_velocities: float = 0.3
     track_hands_as_facet: float = 0.0
+    steady_torso: float = 0.0
     arm_residual: float = -0.02
     upper_torque: float = -2e-5
     upper_acceleration: float = -1e-7
@@ -295,6 +296,11 @@ def track_hands_as_facet(s: StepRecord) -> torch.Tensor:
     return torch.exp(-velocity - position).mean(1)
 
 
+def steady_torso(s: StepRecord) -> torch.Tensor:
+    """The torso's yaw rate against its command, for the arms: what they swing, the torso is turned by."""
+    return track_yaw_rate_closely(s)
+
+
 def arm_residual(s: StepRecord) -> torch.Tensor:
     """Squared residual action of the arms."""
     return s.action[:, s.num_lower :].square().sum(1)
@@ -364,6 +370,7 @@ TERMS: dict[str, Callable[[StepRecord], torch.Tensor]] = {
         track_key_points,
         track_key_velocities,
         track_hands_as_facet,
+        steady_torso,
         arm_residual,
         upper_torque,
         upper_acceleration,
