@@ -16,7 +16,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from cotap import train
 from cotap.agents.checkpoint import load_checkpoint, save_checkpoint
-from cotap.configs import BASE_RECIPES, CONTINUATIONS, BaseTraining, from_plain, to_plain
+from cotap.configs import BASE_RECIPES, CONTINUATIONS, DISTILL_RECIPES, BaseTraining, from_plain, to_plain
 from cotap.envs import H1Env
 from cotap.envs.rewards import LowerRewards, UpperRewards
 from cotap.envs.upper_body import UpperBodyConfig
@@ -633,6 +633,13 @@ def test_robust_walks_as_well_and_takes_blows_and_loads():
     assert walk.env.collision == robust.env.collision == "full"
     assert walk.env.rewards == robust.env.rewards
     assert walk.ppo == robust.ppo
+
+
+def test_distillation_brings_blows_and_loads_to_a_base_that_never_met_them():
+    env = DISTILL_RECIPES["default"](CONTINUATIONS["walk"](BASE_RECIPES["default"]())).env
+    assert env.blows.enabled
+    assert env.hand_forces.enabled
+    assert env.rewards.upper.steady_torso == 0.0
 
 
 def test_feet_that_are_further_apart_than_a_recipe_asks_stay_so():

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from cotap.agents.distillation import DistillationConfig
-from cotap.configs.base import BaseTraining, let_legs_collide, reward_as_facet
+from cotap.configs.base import BaseTraining, calm_the_arms, let_legs_collide, reward_as_facet
 from cotap.configs.base import default as base_default
 from cotap.envs.upper_body import UpperBodyConfig
 
@@ -31,11 +31,12 @@ def default(base: BaseTraining) -> DistillTraining:
     )
     env = training.env
     env.assist.enabled = False
-    env.commands.step_timing = True
+    env.commands.step_timing = env.commands.foresee_falls = True
     let_legs_collide(env)
+    calm_the_arms(env)
     # Under blows from every side these more than halve the falls, without any training.
     env.commands.step_hold_back_m, env.commands.step_catch_lift = 0.45, 0.5
-    env.commands.waist_yield_s, env.commands.waist_damping_s = 0.05, 0.04
+    env.commands.waist_yield_s = 0.05
     env.commands.step_correct_s = 0.1
     env.commands.step_roll_damping_s, env.commands.step_twist_damping_s = 0.02, 0.006
     env.commands.step_straighten_rad = 0.01
@@ -44,6 +45,7 @@ def default(base: BaseTraining) -> DistillTraining:
     env.upper_body.sampling.enabled = True
     env.upper_body.sampling.full_alpha = 0.25
     # The base has taken smaller ones already. From here on one blow in six may throw the robot, and all are hard.
+    env.blows.enabled = env.hand_forces.enabled = True
     blows = env.blows
     blows.force, blows.duration_s, blows.episode_share = (300.0, 600.0), (0.03, 0.06), 0.6
     blows.curriculum_start, blows.curriculum_back = 0.65, 0.1
@@ -53,6 +55,7 @@ def default(base: BaseTraining) -> DistillTraining:
     env.rewards.upper.arm_residual = -10.0
     env.rewards.upper.upper_action_rate = -0.05
     env.rewards.upper.stay_close = 1.0
+    env.rewards.upper.steady_torso = 0.0  # it would move the arms from where compliance puts them
     env.rewards.lower.track_mean_velocity = 6.0
     env.commands.stand_probability = 0.3
     # The base's spread is where exploration goes on from, not where it began.
