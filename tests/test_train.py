@@ -644,9 +644,9 @@ def test_distillation_brings_blows_and_loads_to_a_base_that_never_met_them():
 
 def test_feet_that_are_further_apart_than_a_recipe_asks_stay_so():
     wide = BaseTraining()
-    wide.env.commands.step_apart_m, wide.env.commands.step_clear_m = 0.05, 0.1
+    wide.env.commands.step_apart_m, wide.env.commands.step_clear_m = 0.12, 0.1
     commands = CONTINUATIONS["robust"](wide).env.commands
-    assert (commands.step_apart_m, commands.step_clear_m) == (0.05, 0.15)
+    assert (commands.step_apart_m, commands.step_clear_m) == (0.12, 0.25)
 
 
 def test_a_recipe_that_begins_from_nothing_does_not_resume(checkpoint: Path, capsys: pytest.CaptureFixture[str]):

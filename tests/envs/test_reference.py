@@ -109,7 +109,7 @@ def test_transitions_are_slow_and_end_where_they_should(spec, tmp_path):
     """From a still pose to another, 1 rad away: at most the blend's speed, then exactly the new clip."""
     MotionLibrary([made_clip("a", 0.0), made_clip("b", 1.0)], spec).save(tmp_path / "two.npz")
     clips = ClipConfig(share=1.0, library=str(tmp_path / "two.npz"), hold_s=(2.0, 2.0), blend_speed=0.2)
-    cfg = ReferenceConfig(MotionConfig(), clips)
+    cfg = ReferenceConfig(MotionConfig(), clips, clear_of_legs=False)
     motion = ReferenceMotion(cfg, spec, 1, DT)
     rng = torch.Generator().manual_seed(1)
     motion.reset(everyone(1), rng)

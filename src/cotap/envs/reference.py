@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from cotap.checks import require_interval, require_one_of, require_range
+from cotap.envs.clearance import LegClearance
 from cotap.envs.clips import ClipPlayer
 from cotap.envs.motions import PEAK_SPEED, ArmReference, MotionConfig, MotionGenerator, minimum_jerk
 from cotap.envs.persistence import Stateful, uniform
@@ -61,6 +62,8 @@ class ReferenceConfig:
 
     generator: MotionConfig = field(default_factory=MotionConfig)
     clips: ClipConfig = field(default_factory=ClipConfig)
+    clear_of_legs: bool = True
+    """Whether poses that would put a hand into the legs go outward instead."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
@@ -102,6 +105,7 @@ class ReferenceMotion(Stateful):
             if cfg.clips.share > 0.0
             else None
         )
+        self._clearance = LegClearance(spec) if cfg.clear_of_legs else None
         limit = torch.tensor([j.velocity_limit_rad_s for j in joints])
         self._largest_step, self._blend_speed = dt * limit, cfg.clips.blend_speed * limit
         n = num_envs
@@ -141,7 +145,7 @@ class ReferenceMotion(Stateful):
         self._draw(mask, rng)
         self._offset[mask] = 0.0
         raw = self._raw()
-        self._position = torch.where(mask.unsqueeze(1), raw.position, self._position)
+        self._position = torch.where(mask.unsqueeze(1), self._clear(raw.position), self._position)
         self._velocity = torch.where(mask.unsqueeze(1), raw.velocity, self._velocity)
 
     def step(self, rng: torch.Generator) -> None:
@@ -151,7 +155,7 @@ class ReferenceMotion(Stateful):
         raw = self._advance(rng)
         self._since_s = self._since_s + self._dt
         left = 1.0 - minimum_jerk((self._since_s / self._fade_s).clamp_max(1.0))[0]
-        target = (raw + left.unsqueeze(1) * self._offset).clamp(self._low, self._high)
+        target = self._clear(raw + left.unsqueeze(1) * self._offset)
         position = self._position + (target - self._position).clamp(-self._largest_step, self._largest_step)
         self._velocity = (position - self._position) / self._dt
         self._position = position
@@ -180,6 +184,12 @@ class ReferenceMotion(Stateful):
         if self.clips and clips:
             self.clips.load_state_dict(clips)
             self.clips.clip.clamp_(max=len(self.clips.names) - 1)
+
+    def _clear(self, position: torch.Tensor) -> torch.Tensor:
+        """`position` (N, U) within the joints' limits, hands out of the legs' way."""
+        if self._clearance:
+            position = self._clearance(position)
+        return position.clamp(self._low, self._high)
 
     def _draw(self, mask: torch.Tensor, rng: torch.Generator) -> None:
         if self._led is not None:

@@ -170,6 +170,9 @@ def h1() -> RobotSpec:
         joint_damping=facts["joint_damping"],
         joint_armature=facts["joint_armature"],
         nominal_height_m=1.0205,
+        # Hips are at -0.18 m, 0.20 m out; thighs and forearms are 0.03 to 0.06 m thick, and hips roll.
+        legs_below_m=-0.03,
+        legs_within_m=0.33,
         menagerie="unitree_h1",
         colors=_COLORS,
     )

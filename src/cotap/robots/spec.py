@@ -121,6 +121,10 @@ class RobotSpec:
     joint_armature: float
     nominal_height_m: float
     """Height of the torso link above flat ground in the default pose."""
+    legs_below_m: float
+    """The legs' top in the torso link's frame, as far as hands are concerned."""
+    legs_within_m: float
+    """How far to either side of the middle a low hand may meet them."""
     menagerie: str = ""
     """The robot's name in MuJoCo Menagerie, for those who have its meshes."""
     colors: dict[str, tuple[float, float, float]] = field(default_factory=dict)
