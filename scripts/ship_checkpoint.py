@@ -104,6 +104,7 @@ def ship(source: Path, name: str, before: list[Path], changes: dict[str, float])
             "sha256": sha256(target),
             "commit": config["commit"],
             "command": config["command"],
+            "averaged": config.get("averaged", []),
             "earlier_runs": earlier,
             "changed_after_training": changes,
             "seed": config["training"]["seed"],

@@ -305,7 +305,7 @@ def _train(stage: str, options: BaseOptions | DistillOptions, base: dict[str, An
     run_dir = Path(options.run_dir) if options.run_dir else resumed_dir or _new_run_dir(stage)
     training.env.seed, training.env.num_threads = training.seed, training.threads
     training.check()
-    config = {"stage": stage, "training": to_plain(training), **_provenance(options.command, training.env.backend)}
+    config = {"stage": stage, "training": to_plain(training), **provenance(options.command, training.env.backend)}
     training.env.seed, training.env.num_threads = ranks.seed(training.seed), ranks.threads(training.threads)
     training.device = ranks.device(training.device)
     if training.env.num_threads:
@@ -419,7 +419,7 @@ def _summary(run_dir: Path) -> str:
     return "\n".join(lines)
 
 
-def _provenance(command: str, backend: str) -> dict[str, str]:
+def provenance(command: str, backend: str) -> dict[str, str]:
     """What else a run should remember: the code it ran, the command, the machine, what simulated."""
     try:
         git = ["git", "-C", str(Path(__file__).parent)]
