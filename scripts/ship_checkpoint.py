@@ -87,10 +87,35 @@ def changed(training: dict[str, Any], stage: str, changes: dict[str, float]) -> 
     return to_plain(config)
 
 
-def ship(source: Path, name: str, before: list[Path], changes: dict[str, float]) -> int:
+def scaled(content: dict[str, Any], factors: dict[str, float]) -> dict[str, Any]:
+    """A checkpoint whose policy moves some joints less or more: what the networks send to every joint whose name
+    contains a key of `factors`, times its value.
+
+    Raises:
+        ValueError: a key is in no learned joint's name, or a factor is not within 0.5 to 2.
+    """
+    model = dict(content["model"])
+    for key, factor in factors.items():
+        if not 0.5 <= factor <= 2.0:
+            raise ValueError(f"{key!r} can be scaled by 0.5 to 2, got {factor}")
+        hits = 0
+        for agent, (begin, end) in content["agents"]["action_slices"].items():
+            joints = content["layout"]["joints"][begin:end]
+            rows = [i for i, joint in enumerate(joints) if key in joint]
+            hits += len(rows)
+            for part in ("output_weight", "output_bias"):
+                name = f"actors.{agent}.{part}"
+                model[name] = model[name].clone()
+                model[name][rows] *= factor
+        if hits == 0:
+            raise ValueError(f"{key!r} is in no joint's name: {', '.join(content['layout']['joints'])}")
+    return content | {"model": model}
+
+
+def ship(source: Path, name: str, before: list[Path], changes: dict[str, float], factors: dict[str, float]) -> int:
     """Strip, save, describe, evaluate. Returns the exit status."""
     earlier = earlier_runs(before)
-    content = load_checkpoint(source)
+    content = scaled(load_checkpoint(source), factors)
     target = checkpoint_path(name)
     target.parent.mkdir(exist_ok=True)
     # Where the machine keeps the repository is nobody's business.
@@ -107,6 +132,7 @@ def ship(source: Path, name: str, before: list[Path], changes: dict[str, float])
             "averaged": config.get("averaged", []),
             "earlier_runs": earlier,
             "changed_after_training": changes,
+            "outputs_scaled_after_training": factors,
             "seed": config["training"]["seed"],
             "iterations": content["iteration"],
             "samples": content["samples"],
@@ -122,6 +148,11 @@ def ship(source: Path, name: str, before: list[Path], changes: dict[str, float])
     return 0
 
 
+def numbers(pairs: list[str]) -> dict[str, float]:
+    """Of KEY=VALUE; ValueError where a value is no number."""
+    return {key: float(value) for key, _, value in (text.partition("=") for text in pairs)}
+
+
 def main() -> int:
     """Parse and ship."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -135,11 +166,14 @@ def main() -> int:
         "--change", nargs="*", default=[], metavar="KEY=VALUE",
         help="numbers of the config that the policy is shipped with instead of those it was trained with",
     )  # fmt: skip
+    parser.add_argument(
+        "--scale", nargs="*", default=[], metavar="JOINT=FACTOR",
+        help="what the networks send to joints of which this is a part of the name, times a factor",
+    )  # fmt: skip
     options = parser.parse_args()
-    pairs = [text.partition("=") for text in options.change]
     try:
-        changes = {key: float(value) for key, _, value in pairs}
-        return ship(options.checkpoint, options.name, options.before, changes)
+        changes, factors = numbers(options.change), numbers(options.scale)
+        return ship(options.checkpoint, options.name, options.before, changes, factors)
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -7,11 +7,14 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 import ship_checkpoint as sc
 
+from cotap.agents.checkpoint import load_checkpoint, save_checkpoint
 from cotap.configs import BASE_RECIPES, BaseTraining, DistillTraining, from_plain, to_plain
+from cotap.evaluation.policy import load_policy, shipped_checkpoint
 
 HOLD_BACK, CATCH_LIFT = "env.commands.step_hold_back_m", "env.commands.step_catch_lift"
 
@@ -54,9 +57,45 @@ def test_only_what_is_named_is_changed(stage, kind):
 def test_changes_that_cannot_be_made_are_named_and_nothing_is_shipped(change, needle, tmp_path, monkeypatch, capsys):
     target = tmp_path / "out" / "base.pt"
     monkeypatch.setattr(sc, "checkpoint_path", lambda _: target)
-    content = {"kind": "base", "config": {"command": "train", "training": to_plain(BASE_RECIPES["default"]())}}
+    training = to_plain(BASE_RECIPES["default"]())
+    content = {"kind": "base", "model": {}, "config": {"command": "train", "training": training}}
     monkeypatch.setattr(sc, "load_checkpoint", lambda _: content)
     monkeypatch.setattr(sys, "argv", ["ship_checkpoint.py", "c.pt", "--change", change])
     assert sc.main() == 2
     assert needle in capsys.readouterr().err
     assert not list((tmp_path / "out").glob("*"))
+
+
+def layered() -> dict:
+    """What `scaled` looks at of a checkpoint: two leg joints and an arm's."""
+    model = {f"actors.lower.{part}": torch.ones(2) for part in ("output_weight", "output_bias")}
+    model |= {f"actors.upper.{part}": torch.ones(1) for part in ("output_weight", "output_bias")}
+    slices = {"lower": [0, 2], "upper": [2, 3]}
+    return {"model": model, "agents": {"action_slices": slices}, "layout": {"joints": ["hip_roll", "knee", "arm_roll"]}}
+
+
+def test_outputs_of_the_joints_that_are_named_are_scaled_and_no_others():
+    before = layered()
+    model = sc.scaled(before, {"roll": 0.5, "knee": 2.0})["model"]
+    for part in ("output_weight", "output_bias"):
+        assert model[f"actors.lower.{part}"].tolist() == [0.5, 2.0]
+        assert model[f"actors.upper.{part}"].tolist() == [0.5]
+    assert torch.equal(before["model"]["actors.lower.output_weight"], torch.ones(2))
+
+
+@pytest.mark.parametrize(("factors", "needle"), [({"wheel": 0.9}, "'wheel' is in no"), ({"knee": 0.0}, "got 0.0")])
+def test_outputs_that_cannot_be_scaled_are_named(factors, needle):
+    with pytest.raises(ValueError, match=needle):
+        sc.scaled(layered(), factors)
+
+
+def test_a_scaled_policy_moves_its_joint_by_that_much_and_the_others_as_before(tmp_path):
+    path, scaled = shipped_checkpoint("cotap"), tmp_path / "scaled.pt"
+    content = load_checkpoint(path)
+    save_checkpoint(scaled, sc.scaled(content, {"hip_pitch": 0.9}))
+    width = content["agents"]["observation_widths"]["policy"]
+    observation = {"policy": torch.randn(3, width, generator=torch.Generator().manual_seed(0))}
+    before, after = load_policy(path)(observation), load_policy(scaled)(observation)
+    pitch = torch.tensor(["hip_pitch" in joint for joint in content["layout"]["joints"]])
+    torch.testing.assert_close(after, before * torch.where(pitch, 0.9, 1.0))
+    assert pitch.sum() == 2
