@@ -98,7 +98,7 @@ def let_legs_collide(env: H1EnvConfig) -> None:
     """All shapes meet, and feet keep apart: legs that may pass through each other learn to, and trip anywhere else."""
     env.collision = "full"
     commands = env.commands
-    commands.step_apart_m, commands.step_clear_m = max(commands.step_apart_m, 0.09), max(commands.step_clear_m, 0.25)
+    commands.step_apart_m, commands.step_clear_m = max(commands.step_apart_m, 0.08), max(commands.step_clear_m, 0.25)
 
 
 def calm_the_arms(env: H1EnvConfig) -> None:

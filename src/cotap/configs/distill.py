@@ -35,10 +35,10 @@ def default(base: BaseTraining) -> DistillTraining:
     let_legs_collide(env)
     calm_the_arms(env)
     # Under blows from every side these more than halve the falls, without any training.
-    env.commands.step_hold_back_m, env.commands.step_catch_lift = 0.45, 0.5
+    env.commands.step_hold_back_m, env.commands.step_catch_lift = 0.5, 1.0
     env.commands.waist_yield_s = 0.05
     env.commands.step_correct_s = 0.1
-    env.commands.step_roll_damping_s, env.commands.step_twist_damping_s = 0.02, 0.006
+    env.commands.step_roll_damping_s, env.commands.step_twist_damping_s = 0.024, 0.006
     env.commands.step_straighten_rad = 0.01
     for law in (env.upper_body.left, env.upper_body.right):
         law.name, law.damping = "cotap", "critical"
