@@ -22,7 +22,7 @@ from cotap.deployment.graph import export_policy
 from cotap.deployment.metadata import PolicyError
 from cotap.deployment.policy import OnnxPolicy, arm_advance
 from cotap.deployment.policy import main as timing
-from cotap.envs.actions import JointTargets
+from cotap.envs.actions import ActionConfig, JointTargets
 from cotap.envs.commands import CommandConfig
 from cotap.envs.observations import ObservationHistory, actor_terms
 from cotap.evaluation.policy import load_policy, shipped_checkpoint
@@ -45,6 +45,7 @@ def test_targets_are_the_environments_while_walking_standing_and_crouching(fed_f
     """The graph must contain all that the environment feeds forward; the arms' advance is added outside."""
     content = load_checkpoint(shipped_checkpoint("base"))
     content["config"]["training"]["env"]["commands"].update(fed_forward)
+    content["config"]["training"]["env"]["actions"]["reference_lead_s"] = ActionConfig().reference_lead_s
     save_checkpoint(tmp_path / "apart.pt", content)
     export_policy(tmp_path / "apart.pt", tmp_path / "apart.onnx", checks=20)
     policy = OnnxPolicy(tmp_path / "apart.onnx")
