@@ -204,6 +204,7 @@ def test_a_policy_that_was_trained_with_another_gait_runs_and_says_so(free_port,
         "step_twist_damping_s", "step_straighten_rad", "waist_yield_s", "waist_damping_s", "step_correct_s",
     )  # fmt: skip
     differ = [f"{name} 0.0 (here {getattr(app.session.env.cfg.commands, name)})" for name in names]
+    differ.append("foresee_falls False (here True)")
     assert text == f"facet was trained with {', '.join(differ)}"
     assert app.session.num_steps == 3
 
