@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy.optimize import least_squares
 
-from cotap.compliance.inverse_kinematics import ArmIK, _BatchLastArm
+from cotap.compliance.inverse_kinematics import ArmIK
 from cotap.robots.chains import arm_model
 
 N = 100
@@ -45,13 +45,6 @@ def follow(ik: ArmIK, path: list[torch.Tensor], posture: torch.Tensor, start=Non
 def directions(rng) -> torch.Tensor:
     d = torch.randn(N, 2, 3, generator=rng)
     return d / d.norm(dim=-1, keepdim=True)
-
-
-def test_kinematics_with_the_batch_last_are_those_of_the_chains(arms, posture):
-    tip, jacobian = _BatchLastArm(arms.chains)(posture.permute(2, 1, 0))
-    pose = arms.chains.pose(posture)
-    torch.testing.assert_close(tip.permute(2, 1, 0), pose.tip)
-    torch.testing.assert_close(jacobian.permute(3, 2, 0, 1), arms.chains.jacobian(pose))
 
 
 def test_a_hand_where_it_should_be_stays(arms, ik, posture):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import math
 
 import mujoco
@@ -398,6 +399,17 @@ def test_ended_worlds_restart_within_the_step(make_env):
     torch.testing.assert_close(env.targets.previous[1], env.sim.qpos[1, 7:].float())
     # The record that rewards were given for, and metrics read, is still that of the step.
     assert (env.record.action == 1.0).all()
+    assert env.record.state.projected_gravity_t[1, 2] > -0.5 > env.state.projected_gravity_t[1, 2]
+
+
+def test_after_a_restart_every_world_is_seen_as_it_is(make_env):
+    """Only worlds that restart are read again."""
+    env = make_env(3)
+    rollout(env, 8)
+    knock_over(env, 1)
+    env.step(torch.ones(3, 19))
+    seen, there = dataclasses.asdict(env.state), dataclasses.asdict(env.reader.read())
+    torch.testing.assert_close(seen, there, atol=0.0, rtol=0.0)
 
 
 def test_a_restarted_world_owes_nothing_to_its_past(make_env):

@@ -184,7 +184,7 @@ class DualRunner(OnPolicyRunner):
                 extras["group_rewards"].to(self.device), dones.to(self.device), extras["time_outs"].to(self.device)
             )
             for key, value in extras["log"].items():
-                log[key] = log.get(key, torch.zeros(())) + value
+                log[key] = log[key] + value if key in log else value
         alg.compute_returns(obs)
         collected = time.perf_counter()
         scalars = {key.lstrip("/"): float(value) / alg.cfg.steps for key, value in log.items()}

@@ -52,12 +52,12 @@ class ArmIK:
 
     def __init__(self, chains: SerialChains, low: torch.Tensor, high: torch.Tensor, steps: int = 3) -> None:
         self.steps = require_positive_int("steps", steps)
-        shape = tuple(chains.offsets.shape[:2])
+        shape = (chains.num_chains, chains.num_joints)
         for name, limit in (("low", low), ("high", high)):
             require_shape(name, limit, shape)
         if (low > high).any():
             raise ValueError(f"low must not exceed high, got {low.tolist()} and {high.tolist()}")
-        self._arm = _BatchLastArm(chains)
+        self._chains = chains
         self._low, self._high = low.T.unsqueeze(-1), high.T.unsqueeze(-1)  # (n, A, 1)
 
     def __call__(self, tip: torch.Tensor, posture: torch.Tensor, start: torch.Tensor, most: torch.Tensor) -> IKSolution:
@@ -76,8 +76,9 @@ class ArmIK:
         q = torch.lerp(q, rest, RETURN).clamp(*bounds)
         error = wanted
         for _ in range(self.steps):
-            at, jacobian = self._arm(q)
-            error = wanted - at
+            pose = self._chains.pose(q.permute(2, 1, 0))
+            jacobian = self._chains.jacobian(pose).permute(2, 3, 1, 0)
+            error = wanted - pose.tip.permute(2, 1, 0)
             q = (q + self._step(q, jacobian, error, *bounds)).clamp(*bounds)
         return IKSolution(q.permute(2, 1, 0), error.square().sum(0).sqrt().T)
 
@@ -103,36 +104,3 @@ def _solve_gram(jacobian: torch.Tensor, damping: torch.Tensor, right: torch.Tens
     a, b, c = right.unbind(0)
     solved = torch.stack((cxx * a + cxy * b + cxz * c, cxy * a + cyy * b + cyz * c, cxz * a + cyz * b + czz * c))
     return solved / (xx * cxx + xy * cxy + xz * cxz)
-
-
-class _BatchLastArm:
-    """Forward kinematics of `SerialChains` with the batch last."""
-
-    def __init__(self, chains: SerialChains) -> None:
-        def last(x: torch.Tensor) -> torch.Tensor:
-            """(A, n, ...) to (n, ..., A, 1)."""
-            return x.movedim(0, -1).unsqueeze(-1).contiguous()
-
-        self._fixed, self._sine, self._versine = (last(m) for m in chains.rodrigues)
-        self._offsets, self._axes = last(chains.offsets), last(chains.axes)
-        self._tip = last(chains.tip)
-
-    def __call__(self, q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Tips (3, A, N) [m] and their Jacobians (3, n, A, N) [m/rad] for joint angles (n, A, N) [rad]."""
-        sine, versine = q.sin()[:, None, None], (1.0 - q.cos())[:, None, None]
-        local = self._fixed + sine * self._sine + versine * self._versine  # (n, 3, 3, A, N)
-        rotation, position = local[0], self._offsets[0].expand_as(local[0, 0])
-        anchors, axes = [position], [_apply(rotation, self._axes[0])]
-        for i in range(1, len(q)):
-            position = position + _apply(rotation, self._offsets[i])
-            rotation = (rotation.unsqueeze(2) * local[i]).sum(1)
-            anchors.append(position)
-            axes.append(_apply(rotation, self._axes[i]))
-        tip = position + _apply(rotation, self._tip)
-        arm = tip.unsqueeze(1) - torch.stack(anchors, 1)
-        return tip, torch.linalg.cross(torch.stack(axes, 1), arm, dim=0)
-
-
-def _apply(rotation: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
-    """`rotation vector`, (3, A, N), for (3, 3, A, N) and (3, A, 1)."""
-    return (rotation * vector).sum(1)

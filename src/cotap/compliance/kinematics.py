@@ -32,6 +32,9 @@ class ChainPose:
 class SerialChains:
     """Hinge chains rooted in one body, such as the two arms of a torso.
 
+    Poses are computed with worlds last in memory, and returned as views with worlds first: small matrices side by side
+    take several times as long.
+
     Args:
         offsets: Position of each link in its parent's frame, (A, n, 3) [m].
         quats: Its orientation there at zero angle, (A, n, 4).
@@ -40,44 +43,48 @@ class SerialChains:
     """
 
     def __init__(self, offsets: torch.Tensor, quats: torch.Tensor, axes: torch.Tensor, tip: torch.Tensor) -> None:
-        self.offsets, self.axes, self.tip = offsets, axes, tip
-        self.num_joints = offsets.shape[1]
-        self._fixed = matrix_from_quat(quats)
+        self.num_chains, self.num_joints = offsets.shape[:2]
+        self.tip = tip
+        fixed = matrix_from_quat(quats)
         # Rodrigues' formula, R = I + sin(q) W + (1 - cos(q)) W^2, with the fixed rotation multiplied in beforehand.
         x, y, z = axes.unbind(-1)
         zero = torch.zeros_like(x)
         skew = torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), -1).unflatten(-1, (3, 3))
-        self._sine, self._versine = self._fixed @ skew, self._fixed @ skew @ skew
+        self._fixed, self._sine, self._versine = (_last(m) for m in (fixed, fixed @ skew, fixed @ skew @ skew))
+        self._offsets, self._axes, self._tip = _last(offsets), _last(axes), _last(tip)
 
     def to(self, dtype: torch.dtype) -> SerialChains:
         """The same chains in another precision."""
         out = copy.copy(self)
-        for name in ("offsets", "axes", "tip", "_fixed", "_sine", "_versine"):
+        for name in ("tip", "_fixed", "_sine", "_versine", "_offsets", "_axes", "_tip"):
             setattr(out, name, getattr(self, name).to(dtype))
         return out
 
-    @property
-    def rodrigues(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Matrices F, S and V, (A, n, 3, 3), of rotations into the links' parents, `F + sin(q) S + (1 - cos(q)) V`."""
-        return self._fixed, self._sine, self._versine
-
     def pose(self, q: torch.Tensor) -> ChainPose:
         """Pose of every link for joint angles `q` (W, A, n) [rad]."""
-        sine, versine = q.sin()[..., None, None], (1.0 - q.cos())[..., None, None]
-        local = self._fixed + sine * self._sine + versine * self._versine  # (W, A, n, 3, 3)
-        position, rotation = self.offsets[:, 0].expand(q.shape[0], -1, 3), local[:, :, 0]
-        rotations = [rotation]
-        anchors, axes = [position], [(rotation @ self.axes[:, 0, :, None]).squeeze(-1)]
+        angle = q.permute(2, 1, 0).contiguous()[:, None, None]
+        local = self._fixed + angle.sin() * self._sine + (1.0 - angle.cos()) * self._versine  # (n, 3, 3, A, W)
+        position, rotation = self._offsets[0].expand_as(local[0, 0]), local[0]
+        anchors, rotations = [position], [rotation]
         for i in range(1, self.num_joints):
-            position = position + (rotation @ self.offsets[:, i, :, None]).squeeze(-1)
-            rotation = rotation @ local[:, :, i]
-            rotations.append(rotation)
+            position = position + (rotation * self._offsets[i]).sum(1)
+            rotation = (rotation.unsqueeze(2) * local[i]).sum(1)
             anchors.append(position)
-            axes.append((rotation @ self.axes[:, i, :, None]).squeeze(-1))
-        tip = position + (rotation @ self.tip[..., None]).squeeze(-1)
-        return ChainPose(torch.stack(anchors, 2), torch.stack(axes, 2), torch.stack(rotations, 2), tip)
+            rotations.append(rotation)
+        tip = position + (rotation * self._tip).sum(1)
+        turned = torch.stack(rotations)
+        axes = (turned * self._axes.unsqueeze(1)).sum(2)
+        return ChainPose(
+            torch.stack(anchors).permute(3, 2, 0, 1), axes.permute(3, 2, 0, 1), turned.permute(4, 3, 0, 1, 2),
+            tip.permute(2, 1, 0),
+        )  # fmt: skip
 
     @staticmethod
     def jacobian(pose: ChainPose) -> torch.Tensor:
         """Jacobian of the tip's position in the root frame, (W, A, 3, n) [m/rad]."""
         return torch.linalg.cross(pose.axes, pose.tip.unsqueeze(2) - pose.anchors).transpose(-1, -2)
+
+
+def _last(constant: torch.Tensor) -> torch.Tensor:
+    """A chain's constant (A, ...) as (..., A, 1), to go with worlds last."""
+    return constant.movedim(0, -1).unsqueeze(-1).contiguous()

@@ -33,7 +33,10 @@ class LegClearance:
             pose = self._chains.pose(q)
             depth = ((self._below - pose.tip[..., 2]) / RAMP_M).clamp(0.0, 1.0)
             missing = depth * (self._within - self._outward * pose.tip[..., 1]).clamp_min(0.0)
-            sideways = self._chains.jacobian(pose)[..., 1, :]
+            if not missing.any():
+                break
+            arm = pose.tip.unsqueeze(2) - pose.anchors
+            sideways = pose.axes[..., 2] * arm[..., 0] - pose.axes[..., 0] * arm[..., 2]  # [m/rad]
             # What little is added keeps an arm that cannot move its hand sideways from turning over.
             share = self._outward * missing / (sideways.square().sum(-1) + 1e-3)
             q = q + share.unsqueeze(-1) * sideways

@@ -618,18 +618,21 @@ class H1Env(VecEnv):
     def _reward(self, record: StepRecord, bad: torch.Tensor) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         totals: list[torch.Tensor] = []
         log: dict[str, torch.Tensor] = {}
+        # A diverged world has no meaningful reward; its episode ends and is counted.
+        any_bad, ok = bool(bad.any()), ~bad
         for group in self._groups:
             total, terms = group(record)
-            # A diverged world has no meaningful reward; its episode ends and is counted.
-            totals.append(torch.where(bad, torch.zeros_like(total), total))
-            log.update({f"/{group.name}/{name}": _mean(value[~bad]) for name, value in terms.items()})
+            totals.append(torch.where(bad, 0.0, total) if any_bad else total)
+            means = _mean(terms[:, ok] if any_bad else terms)
+            log.update({f"/{group.name}/{name}": mean for name, mean in zip(group.terms, means.unbind(), strict=True)})
         return torch.stack(totals, 1), log
 
     def _log(
         self, r: StepRecord, fell: torch.Tensor, time_out: torch.Tensor, bad: torch.Tensor
     ) -> dict[str, torch.Tensor]:
-        self.num_diverged += int(bad.sum())
-        ok = ~bad
+        num_bad = int(bad.sum())
+        self.num_diverged += num_bad
+        ok = ~bad if num_bad else slice(None)
         measured = torch.cat((r.state.torso_linear_velocity_h[:, :2], r.state.yaw_rate.unsqueeze(1)), 1)[ok]
         commanded = torch.cat((r.command.velocity_h, r.command.yaw_rate.unsqueeze(1)), 1)[ok]
         slope = (measured * commanded).sum(0) / commanded.square().sum(0).clamp_min(1e-6)
@@ -698,7 +701,11 @@ class H1Env(VecEnv):
         self._mean_error[mask] = 0.0
         self._hand_force_w[mask] = 0.0
         self.episode_length_buf[mask] = 0
-        self.state = self.reader.read()
+        if n == self.num_envs:
+            self.state = self.reader.read()
+        else:
+            ids = mask.nonzero().squeeze(1)
+            self.state = self.state.with_worlds(ids, self.reader.read(ids))
         self.path.reset(mask, self.state.torso_pos_w[:, :2], self.state.heading_w, self.rng)
 
     def _observe(self, restarted: torch.Tensor) -> None:
@@ -735,5 +742,5 @@ class H1Env(VecEnv):
 
 
 def _mean(values: torch.Tensor) -> torch.Tensor:
-    """Mean of `values` (n,); 0 if there are none, as when all worlds have diverged."""
-    return values.sum() / max(values.numel(), 1)
+    """Means over the last dimension of `values` (..., n); 0 if there are none, as when all worlds have diverged."""
+    return values.sum(-1) / max(values.shape[-1], 1)

@@ -118,12 +118,13 @@ class MotionGenerator(Stateful):
         return ArmReference(position, velocity)
 
     def _draw(self, mask: torch.Tensor, rng: torch.Generator) -> None:
-        n = int(mask.sum())
+        ids = mask.nonzero().squeeze(1)
+        n = len(ids)
         if n == 0:
             return
         u = self.default.shape[0]
         # Where a world ends up: out-and-back and oscillating segments end where they began.
-        start = torch.where(self._out_and_back[mask, None] > 0.5, self._start[mask], self._goal[mask])
+        start = torch.where(self._out_and_back[ids, None] > 0.5, self._start[ids], self._goal[ids])
         kind = torch.multinomial(self._weights, n, replacement=True, generator=rng)
         is_kind = {name: (kind == i).float().unsqueeze(1) for i, name in enumerate(KINDS)}
         goal = self._low + (self._high - self._low) * torch.rand(n, u, generator=rng, device=rng.device)
@@ -146,9 +147,9 @@ class MotionGenerator(Stateful):
         # The oscillation's speed is at most amplitude * pi (2 cycles + 1) / duration.
         peak = math.pi * (2.0 * cycles + 1.0) / duration
         amplitude = amplitude.sign() * torch.minimum(amplitude.abs(), self._speed / peak.unsqueeze(1))
-        self._start[mask], self._goal[mask], self._amplitude[mask] = start, goal, amplitude
-        self._duration_s[mask], self._cycles[mask], self._time_s[mask] = duration, cycles, 0.0
-        self._out_and_back[mask] = is_kind["punch"].squeeze(1)
+        self._start[ids], self._goal[ids], self._amplitude[ids] = start, goal, amplitude
+        self._duration_s[ids], self._cycles[ids], self._time_s[ids] = duration, cycles, 0.0
+        self._out_and_back[ids] = is_kind["punch"].squeeze(1)
 
     def _oscillation(self, start: torch.Tensor, is_kind: dict[str, torch.Tensor], rng: torch.Generator) -> torch.Tensor:
         """Signed amplitudes (n, U) that keep within the limits around `start`."""

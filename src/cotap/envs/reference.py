@@ -144,9 +144,9 @@ class ReferenceMotion(Stateful):
         self.generator.reset(mask, rng)
         self._draw(mask, rng)
         self._offset[mask] = 0.0
-        raw = self._raw()
-        self._position = torch.where(mask.unsqueeze(1), self._clear(raw.position), self._position)
-        self._velocity = torch.where(mask.unsqueeze(1), raw.velocity, self._velocity)
+        raw, ids = self._raw(), mask.nonzero().squeeze(1)
+        self._position = self._position.index_put((ids,), self._clear(raw.position[ids]))
+        self._velocity = self._velocity.index_put((ids,), raw.velocity[ids])
 
     def step(self, rng: torch.Generator) -> None:
         """Advance by one control step."""

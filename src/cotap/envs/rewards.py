@@ -387,18 +387,18 @@ ONCE = ("fall",)
 
 
 class RewardGroup:
-    """The weighted sum of one agent's terms, and each term's own mean for the log."""
+    """The weighted sum of one agent's terms."""
 
     def __init__(self, name: str, weights: LowerRewards | UpperRewards, dt: float) -> None:
         check_weights(name, weights)
         self.name = name
-        self.terms: dict[str, tuple[Callable[[StepRecord], torch.Tensor], float]] = {}
-        for f in fields(weights):
-            weight = getattr(weights, f.name)
-            if weight != 0.0:
-                self.terms[f.name] = (TERMS[f.name], weight * (1.0 if f.name in ONCE else dt))
+        chosen = {f.name: getattr(weights, f.name) for f in fields(weights) if getattr(weights, f.name) != 0.0}
+        self.terms: dict[str, Callable[[StepRecord], torch.Tensor]] = {name: TERMS[name] for name in chosen}
+        """Those whose weight is not zero, by name."""
+        shares = [weight * (1.0 if name in ONCE else dt) for name, weight in chosen.items()]
+        self._weights = torch.tensor(shares).unsqueeze(1)
 
-    def __call__(self, record: StepRecord) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """Total reward (N,) of a step, and the weighted terms, (N,) each."""
-        values = {name: term(record) * weight for name, (term, weight) in self.terms.items()}
-        return torch.stack(list(values.values())).sum(0), values
+    def __call__(self, record: StepRecord) -> tuple[torch.Tensor, torch.Tensor]:
+        """Total reward (N,) of a step, and the weighted terms (K, N) in the order of `terms`."""
+        values = torch.stack([term(record) for term in self.terms.values()]) * self._weights
+        return values.sum(0), values

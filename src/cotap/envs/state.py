@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, fields
+from typing import Protocol, TypeVar
 
 import torch
 
@@ -67,6 +67,24 @@ class RobotState:
         """(N,) height of the torso link's origin above the ground [m]."""
         return self.torso_pos_w[:, 2]
 
+    def with_worlds(self, ids: torch.Tensor, other: RobotState) -> RobotState:
+        """A copy in which the worlds `ids` (n,) are in the state of `other`, which has n worlds."""
+        return _with_rows(self, ids, other)
+
+
+_Rows = TypeVar("_Rows", RobotState, ChainPose)
+
+
+def _with_rows(mine: _Rows, ids: torch.Tensor, other: _Rows) -> _Rows:
+    """A copy of `mine`, worlds first in every tensor, with `other` in the rows `ids`."""
+    values = {}
+    for f in fields(mine):
+        value, new = getattr(mine, f.name), getattr(other, f.name)
+        values[f.name] = (
+            value.index_put((ids,), new) if isinstance(value, torch.Tensor) else _with_rows(value, ids, new)
+        )
+    return type(mine)(**values)
+
 
 class StateSource(Protocol):
     """Where raw vectors come from: a batched simulation, or one robot as a batch of one."""
@@ -105,9 +123,10 @@ class StateReader:
         """Pick the arms out of (N, J): (N, arms, joints per arm)."""
         return values[:, self._arm_ids].unflatten(1, (self._num_arms, -1))
 
-    def read(self) -> RobotState:
-        """The state now."""
-        qpos, qvel = self._source.qpos.to(self._dtype), self._source.qvel.to(self._dtype)
+    def read(self, ids: torch.Tensor | None = None) -> RobotState:
+        """The state now, of all worlds or of the worlds `ids` (n,)."""
+        rows = slice(None) if ids is None else ids
+        qpos, qvel = self._source.qpos[rows].to(self._dtype), self._source.qvel[rows].to(self._dtype)
         q, dq = qpos[:, 7:], qvel[:, 6:]
         base = matrix_from_quat(torch.nn.functional.normalize(qpos[:, 3:7], dim=-1))
         waist = self._waist.pose(q[:, None, self._waist_ids])
@@ -119,7 +138,7 @@ class StateReader:
         torso = base @ waist.rotation[:, 0]
         heading = heading_matrix(torso)
         angular_w = rotate(base, angular_b)
-        foot = {k: torch.stack(v, 1) for k, v in self._foot_sensors.items()}
+        foot = {k: torch.stack([view[rows] for view in v], 1) for k, v in self._foot_sensors.items()}
         return RobotState(
             joint_pos=q,
             joint_vel=dq,
@@ -132,7 +151,7 @@ class StateReader:
             yaw_rate=angular_w[:, 2],
             projected_gravity_t=-torso[:, 2, :],
             arms=self.arm_chains.pose(self.arm_joints(q)),
-            foot_force=torch.cat(self._touch, 1),
+            foot_force=torch.cat([view[rows] for view in self._touch], 1),
             foot_pos_w=foot["pos"],
             foot_velocity_w=foot["vel"],
             foot_up_w=foot["up"],
