@@ -180,7 +180,9 @@ def run(policy: Policy, options: argparse.Namespace, seed: int) -> tuple[list[Te
     if options.trials == "impact":
         trials = Impact(num_envs=n, seed=seed, motion=motion, mode=options.mode, random_direction=True)
     else:
-        trials = VelocityTracking(num_envs=n, seed=seed, motion=motion, episode_seconds=options.seconds)
+        trials = VelocityTracking(
+            num_envs=n, seed=seed, motion=motion, episode_seconds=options.seconds, hand_force=options.hand_force
+        )
     torch.manual_seed(seed)
     cfg = trials.configure(policy.env_config)
     cfg.upper_body = LawOptions(options.method, (options.stiffness,), alpha=options.alpha).configure()
@@ -230,6 +232,7 @@ def main(args: list[str] | None = None) -> int:
     parser.add_argument("--worlds", type=int, default=1024, help="per batch")
     parser.add_argument("--runs", type=int, default=8, help="batches")
     parser.add_argument("--seconds", type=float, default=10.0, help="of commands")
+    parser.add_argument("--hand-force", type=float, default=0.0, help="random, under commands, per axis [N]")
     parser.add_argument("--seed", type=int, default=1000, help="of the first batch")
     parser.add_argument("--threads", type=int, default=0)
     parser.add_argument("--output", type=Path, help="JSON with terms and fits")

@@ -141,7 +141,8 @@ def test_too_few_worlds_are_refused_by_name():
 @pytest.mark.parametrize("trials", ["impact", "commands"])
 def test_from_the_command_line(trials, tmp_path, capsys):
     out = tmp_path / "found.json"
-    args = ["--trials", trials, "--worlds", "40", "--runs", "2", "--seconds", "5", "--threads", "1"]
+    force = ["--hand-force", "20"] if trials == "commands" else []
+    args = ["--trials", trials, *force, "--worlds", "40", "--runs", "2", "--seconds", "5", "--threads", "1"]
     assert rf.main([*args, "--output", str(out)]) == 0
     shown = capsys.readouterr()
     assert "80 worlds" in shown.out
