@@ -91,20 +91,28 @@ class Perturbed:
 
     def __init__(self, env: H1Env, terms: list[Term], values: torch.Tensor) -> None:
         self._own: JointTargets = env.joint_targets
-        self._terms = [(term, term.deviation * values[:, k]) for k, term in enumerate(terms)]
+        n, joints = len(values), self._own.steps.joints.shape[1]
+        self._per_joint = {kind: torch.zeros(n, 1, joints) for kind in ("damping", "gain", "offset")}
+        self._feedback: list[tuple[Term, torch.Tensor]] = []
+        self._shared: dict[str, torch.Tensor] = {}
+        for term, value in zip(terms, values.unbind(1), strict=True):
+            if term.kind in self._per_joint:
+                self._per_joint[term.kind][:, 0, term.joint] = term.deviation * value
+            elif term.sense:
+                self._feedback.append((term, term.deviation * value))
+            else:
+                self._shared[term.kind] = value
         cfg, period = env.cfg.actions, env.cfg.commands.gait_period_s
 
         def step_motion(lift: float = 0.0, apart_m: float = 0.0) -> StepMotion:
-            """Steps with a deviation of every term that is theirs."""
+            """Steps with one deviation of every term that is theirs."""
             return StepMotion(
                 env.spec, env.sim.model, period, lift, 0.0, apart_m, hold_back_m=HOLD_BACK_M, catch_lift=CATCH_LIFT
             )
 
         self._steps = step_motion(lift=cfg.step_lift)
         still = torch.zeros(1)
-        self._apart = step_motion(apart_m=APART_M)(still, torch.zeros(1, 2), still)[0]
-        waist = [body.joint or "" for body in env.spec.chain(env.spec.torso_body, env.spec.base_body)]
-        self._waist = env.spec.indices(waist)
+        self._apart = step_motion(apart_m=APART_M)(still, torch.zeros(1, 2), still)
 
     def __getattr__(self, name: str) -> object:
         return getattr(self._own, name)
@@ -119,28 +127,16 @@ class Perturbed:
         spin = w[:, 2] - command.yaw_rate
         senses = {"gx": g[:, 0], "gy": g[:, 1], "wx": w[:, 0], "wy": w[:, 1], "wz": spin}
         swings = (swing_progress(command.phase, len(joints)) > 0.0).float()
-        legs = torch.zeros(len(action), *joints.shape)
-        for term, value in self._terms:
-            one, i = value.unsqueeze(1), joints[:, term.joint]
-            all_joints = (value / term.deviation)[:, None, None]
-            match term.kind:
-                case "damping":
-                    legs[..., term.joint] -= one * joint_vel[:, i]
-                case "gain":
-                    legs[..., term.joint] += one * self._own.scale[i] * action[:, i]
-                case "offset":
-                    legs[..., term.joint] += one
-                case "apart":
-                    legs += all_joints * self._apart
-                case "hold_back":
-                    legs += all_joints * self._steps.holding_back(command.phase, g)
-                case "catch_lift":
-                    legs += all_joints * self._steps.catching(command.phase, g)
-                case "waist":
-                    target[:, self._waist] += (value * spin).unsqueeze(1)
-                case _:
-                    share = swings if term.kind == "swinging" else 1.0 - swings
-                    legs[..., term.joint] += share * (value * senses[term.sense]).unsqueeze(1)
+        own, shared = self._per_joint, {kind: value[:, None, None] for kind, value in self._shared.items()}
+        legs = own["offset"] - own["damping"] * joint_vel[:, joints]
+        legs = legs + own["gain"] * self._own.scale[joints] * action[:, joints]
+        legs = legs + shared["apart"] * self._apart
+        legs = legs + shared["hold_back"] * self._steps.holding_back(command.phase, g)
+        legs = legs + shared["catch_lift"] * self._steps.catching(command.phase, g)
+        for term, value in self._feedback:
+            share = swings if term.kind == "swinging" else 1.0 - swings
+            legs[..., term.joint] += share * (value * senses[term.sense]).unsqueeze(1)
+        target[:, self._own.waist] += (WAIST_S * self._shared["waist"] * spin).unsqueeze(1)
         target[:, joints] += (1.0 - command.stand)[:, None, None] * legs
         return target
 
@@ -186,7 +182,7 @@ def run(policy: Policy, options: argparse.Namespace, seed: int) -> tuple[list[Te
     torch.manual_seed(seed)
     cfg = trials.configure(policy.env_config)
     cfg.upper_body = LawOptions(options.method, (options.stiffness,), alpha=options.alpha).configure()
-    cfg.num_threads = options.threads
+    cfg.backend, cfg.num_threads = "mjbatch", options.threads
     env = H1Env(cfg)
     terms = terms_of(env)
     values = torch.randn(options.worlds, len(terms), generator=torch.Generator().manual_seed(seed))

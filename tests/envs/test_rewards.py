@@ -213,8 +213,11 @@ def test_the_sum_of_the_terms_is_the_reward():
     record = changed(torque=[[1.0, -2.0, 3.0, 50.0, 50.0]], torso_linear_velocity_h=[[0.2, 0.2, 0.4]])
     group = RewardGroup("lower", LowerRewards(), DT)
     total, terms = group(record)
-    assert total.tolist() == [pytest.approx(float(terms.double().sum()), abs=1e-6)]
-    assert terms.shape == (len(group.terms), 1)
+    weights = dataclasses.asdict(LowerRewards())
+    expected = [weights[name] * (1.0 if name == "fall" else DT) * float(TERMS[name](record)) for name in group.terms]
+    assert terms.squeeze(1).tolist() == pytest.approx(expected, abs=1e-6)
+    assert total.tolist() == [pytest.approx(sum(expected), abs=1e-6)]
+    assert len({abs(value) for value in expected if value != 0.0}) > 5  # in another order they would differ
 
 
 def test_weights_must_be_finite():

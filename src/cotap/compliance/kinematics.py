@@ -44,7 +44,6 @@ class SerialChains:
 
     def __init__(self, offsets: torch.Tensor, quats: torch.Tensor, axes: torch.Tensor, tip: torch.Tensor) -> None:
         self.num_chains, self.num_joints = offsets.shape[:2]
-        self.tip = tip
         fixed = matrix_from_quat(quats)
         # Rodrigues' formula, R = I + sin(q) W + (1 - cos(q)) W^2, with the fixed rotation multiplied in beforehand.
         x, y, z = axes.unbind(-1)
@@ -56,7 +55,7 @@ class SerialChains:
     def to(self, dtype: torch.dtype) -> SerialChains:
         """The same chains in another precision."""
         out = copy.copy(self)
-        for name in ("tip", "_fixed", "_sine", "_versine", "_offsets", "_axes", "_tip"):
+        for name in ("_fixed", "_sine", "_versine", "_offsets", "_axes", "_tip"):
             setattr(out, name, getattr(self, name).to(dtype))
         return out
 

@@ -76,7 +76,8 @@ class JointTargets:
             commands.step_twist_damping_s, commands.step_straighten_rad,
         )  # fmt: skip
         waist = [body.joint or "" for body in spec.chain(spec.torso_body, spec.base_body)]
-        self._waist = spec.indices(waist)
+        self.waist = spec.indices(waist)
+        """Joints that turn the torso."""
         self._waist_yield_s, self._waist_damping_s = commands.waist_yield_s, commands.waist_damping_s
         self.stance = StanceBalance(spec, model)
         twists = [j.axis == (0.0, 0.0, 1.0) for j in spec.joints]
@@ -107,7 +108,7 @@ class JointTargets:
         step = step + self.steps.damping(joint_vel)
         target[:, self.steps.joints] += (1.0 - command.stand)[:, None, None] * step
         if self._waist_yield_s > 0.0 or self._waist_damping_s > 0.0:
-            target[:, self._waist] += self._waist_turn(command, projected_gravity, angular_velocity).unsqueeze(1)
+            target[:, self.waist] += self._waist_turn(command, projected_gravity, angular_velocity).unsqueeze(1)
         legs = self.stance.joints
         stance = self.stance(command.height, joint_pos, joint_vel, projected_gravity, angular_velocity)
         share = self.cfg.stance_balance * command.stand[:, None, None]

@@ -33,7 +33,7 @@ class LegClearance:
             pose = self._chains.pose(q)
             depth = ((self._below - pose.tip[..., 2]) / RAMP_M).clamp(0.0, 1.0)
             missing = depth * (self._within - self._outward * pose.tip[..., 1]).clamp_min(0.0)
-            if not missing.any():
+            if not missing.any():  # most often so where few worlds restart
                 break
             arm = pose.tip.unsqueeze(2) - pose.anchors
             sideways = pose.axes[..., 2] * arm[..., 0] - pose.axes[..., 0] * arm[..., 2]  # [m/rad]

@@ -350,10 +350,13 @@ class H1Env(VecEnv):
         time_out = (self.episode_length_buf >= self.max_episode_length) & ~fell
         record = self._record(action, velocity_before, fell)
         self.record = record
-        rewards, log = self._reward(record, bad)
+        num_bad = int(bad.sum())
+        self.num_diverged += num_bad
+        ok = ~bad if num_bad else slice(None)  # picking all of the worlds by a mask would copy them
+        rewards, log = self._reward(record, bad, ok)
         self._last_action = action.clone()  # the record keeps its own: restarts clear this one
         done = fell | time_out
-        log.update(self._log(record, fell, time_out, bad))
+        log.update(self._log(record, fell, time_out, ok))
         if done.any():
             self._finish(done, fell & ~thrown)
             self._restart(done)
@@ -615,24 +618,22 @@ class H1Env(VecEnv):
         )
         return torch.cat((arms.tip, elbows), 1), torch.cat((hand_velocity, elbow_velocity), 1)
 
-    def _reward(self, record: StepRecord, bad: torch.Tensor) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    def _reward(
+        self, record: StepRecord, bad: torch.Tensor, ok: torch.Tensor | slice
+    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         totals: list[torch.Tensor] = []
         log: dict[str, torch.Tensor] = {}
         # A diverged world has no meaningful reward; its episode ends and is counted.
-        any_bad, ok = bool(bad.any()), ~bad
         for group in self._groups:
             total, terms = group(record)
-            totals.append(torch.where(bad, 0.0, total) if any_bad else total)
-            means = _mean(terms[:, ok] if any_bad else terms)
+            totals.append(torch.where(bad, 0.0, total))
+            means = _mean(terms[:, ok])
             log.update({f"/{group.name}/{name}": mean for name, mean in zip(group.terms, means.unbind(), strict=True)})
         return torch.stack(totals, 1), log
 
     def _log(
-        self, r: StepRecord, fell: torch.Tensor, time_out: torch.Tensor, bad: torch.Tensor
+        self, r: StepRecord, fell: torch.Tensor, time_out: torch.Tensor, ok: torch.Tensor | slice
     ) -> dict[str, torch.Tensor]:
-        num_bad = int(bad.sum())
-        self.num_diverged += num_bad
-        ok = ~bad if num_bad else slice(None)
         measured = torch.cat((r.state.torso_linear_velocity_h[:, :2], r.state.yaw_rate.unsqueeze(1)), 1)[ok]
         commanded = torch.cat((r.command.velocity_h, r.command.yaw_rate.unsqueeze(1)), 1)[ok]
         slope = (measured * commanded).sum(0) / commanded.square().sum(0).clamp_min(1e-6)
