@@ -107,3 +107,20 @@ def test_references_keep_clear_unless_told_not_to(spec, full):
                 met[clear] += sum(arms_meet_legs(spec, full, q) for q in motion.current().position)
     assert met[False] > 15
     assert met[True] * 10 <= met[False]  # two Newton steps leave one in hundreds
+
+
+def test_a_restarted_world_begins_where_its_reference_is_clear(spec):
+    n, position = 400, {}
+    mask = torch.arange(n) % 2 == 1
+    for clear in (True, False):
+        motion = ReferenceMotion(ReferenceConfig(clear_of_legs=clear), spec, n, 0.02)
+        before = motion.current().position.clone()
+        motion.reset(mask, torch.Generator().manual_seed(0))
+        position[clear] = motion.current().position
+        assert torch.equal(position[clear][~mask], before[~mask])
+    joints = [spec.joints[i] for i in spec.indices(spec.upper_joints)]
+    low, high = torch.tensor([j.range_rad for j in joints]).unbind(1)
+    margin = ReferenceConfig().generator.limit_margin_rad
+    expected = LegClearance(spec)(position[False][mask]).clamp(low + margin, high - margin)
+    torch.testing.assert_close(position[True][mask], expected, atol=1e-6, rtol=0)
+    assert float((expected - position[False][mask]).abs().max()) > 0.1
