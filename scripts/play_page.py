@@ -28,6 +28,7 @@ import numpy as np
 import tyro
 
 from cotap.checks import require_one_of, require_range
+from cotap.files import require_output, write_atomically
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 ARGUMENTS = [
@@ -212,10 +213,8 @@ class Film:
         require_range("scale", self.scale, 0.1, 1.0)
         require_range("fps", self.fps, 1.0, 50.0)
         require_range("force", self.force, 5.0, 300.0)
-        for path in filter(None, (self.output, self.picture)):
-            if not Path(path).resolve().parent.is_dir():
-                raise ValueError(f"{path!r}: its folder does not exist")
-        require_one_of("output's suffix", Path(self.output).suffix, (".webp", ".gif"))
+        require_output("--output", self.output, (".webp", ".gif"))
+        require_output("--picture", self.picture, (".png",))
         from cotap.evaluation.policy import default_checkpoint
         from cotap.play import ROBOTS
         from cotap.play.app import App
@@ -286,16 +285,12 @@ class Film:
         push()
         shoot(0.4)
         if self.picture:
-            from cotap.files import write_atomically
-
             write_atomically(Path(self.picture), lambda p: p.write_bytes(pictures[-1]))
         shoot(1.2)
         return pictures
 
     def _write(self, pictures: list[bytes]) -> str:
         from PIL import Image
-
-        from cotap.files import write_atomically
 
         size = (round(self.width * self.scale), round(self.height * self.scale))
         images = [

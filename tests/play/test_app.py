@@ -97,6 +97,16 @@ def test_of_a_drag_out_of_reach_people_are_told_once(app, told):
     assert app.session.values["a.right.drag"] is None
 
 
+@pytest.mark.parametrize("index", [None, -1, 4])
+def test_a_drag_of_no_hand_on_the_page_does_nothing(app, told, index):
+    before = dict(app.session.values)
+    event = SimpleNamespace(instance_index=index, phase="start", end_position=(0.0, 0.0, 1.0), client=None)
+    asyncio.run(app._drag(event))
+    app.advance()
+    assert app.session.values == before
+    assert not told
+
+
 def test_paused_it_stands_still_but_for_single_steps_and_reset_starts_over(app):
     app.advance()
     app.mailbox.set("paused", True)

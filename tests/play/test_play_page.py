@@ -19,7 +19,8 @@ import play_page
     ("arguments", "message"),
     [(["dance"], "command 'dance' is unknown"), (["speed", "--viewers", "0"], "viewers must lie in"),
      (["film", "--output", "no/such/play.webp"], "'no/such/play.webp': its folder does not exist"),
-     (["film", "--output", "play.mp3"], "suffix '.mp3' is unknown"), (["film", "--fps", "0"], "fps must lie in"),
+     (["film", "--output", "play.mp3"], "--output must end in .webp or .gif, got 'play.mp3'"),
+     (["film", "--picture", "play.jpg"], "--picture must end in .png"), (["film", "--fps", "0"], "fps must lie in"),
      (["speed"], "no browser")],
 )  # fmt: skip
 def test_bad_input_is_named(arguments, message, capsys, monkeypatch):

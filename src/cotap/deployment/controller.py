@@ -17,6 +17,7 @@ from cotap.deployment.metadata import PolicyError, PolicyMetadata
 from cotap.deployment.policy import OnnxPolicy, arm_advance
 from cotap.envs.commands import CommandConfig, CommandSource, leaning
 from cotap.envs.foresight import Foresight
+from cotap.envs.load_sense import LoadSense
 from cotap.envs.observations import ObservationHistory, actor_terms, actor_values
 from cotap.envs.reference import ReferenceMotion
 from cotap.envs.state import RobotState
@@ -121,6 +122,7 @@ class Controller:
         self._everyone = torch.ones(1, dtype=torch.bool)
         self.commands = CommandSource(commands, 1, spec.nominal_height_m, self.dt)
         self._foresight = Foresight(spec) if commands.foresee_falls else None
+        self._load_sense = LoadSense(spec, 1, self.dt) if commands.lean_into_loads else None
         self._timing = StepTiming(spec, 1, self.dt, commands.step_correct_s) if commands.step_timing else None
         self.motion = motion
         self.upper_body = UpperBody(laws, spec, 1, self.dt, torch.float64)
@@ -140,6 +142,8 @@ class Controller:
         self.commands.reset(self._everyone, self._rng)
         if self._timing:
             self._timing.reset(self._everyone)
+        if self._load_sense:
+            self._load_sense.reset(self._everyone)
         self.motion.reset(self._everyone, self._rng)
 
     @property
@@ -156,6 +160,10 @@ class Controller:
         s = readings.state
         if self._started:
             turning = s.torso_angular_velocity_t
+            if self._load_sense:
+                torque = torch.from_numpy(readings.torque).unsqueeze(0)
+                self._load_sense.step(s, self.commands.current(), torque)
+                s = self._load_sense.felt(s)
             lean, command = leaning(s.projected_gravity_t, turning), self.commands.current()
             if self._foresight:
                 lean = self._foresight.lean(lean, s, command)

@@ -71,6 +71,8 @@ class CommandConfig:
     foresee_falls: bool = False
     """Whether a standing robot steps as soon as its joints and IMU tell that it will fall (`Foresight`), instead of
     from `steady_rad` on."""
+    lean_into_loads: bool = False
+    """Whether the vertical that steps, standing and policy go by is tilted by what pulls at the robot (`LoadSense`)."""
     step_timing: bool = False
     """Whether the gait clock jumps to where a robot that was struck catches itself (`StepTiming`)."""
     step_correct_s: float = 0.0

@@ -32,6 +32,7 @@ from cotap.envs.forces import ForceProfile, ScriptedForces
 from cotap.envs.foresight import Foresight
 from cotap.envs.gait import desired_contact, swing_progress
 from cotap.envs.impedance import ImpedanceConfig, PathFollower
+from cotap.envs.load_sense import LoadSense
 from cotap.envs.observations import (
     GOALS_PER_ARM,
     ObservationConfig,
@@ -202,10 +203,12 @@ class H1Env(VecEnv):
             [b.name for b in spec.chain(a.hand_body, spec.torso_body)].index(a.elbow_body) for a in spec.arms
         ]
         self._base_body = model.body(spec.base_body).id
-        self._weight_n = float(model.body_mass.sum()) * GRAVITY
+        self.weight_n = float(model.body_mass.sum()) * GRAVITY
+        """Of the nominal robot [N]."""
 
         self.commands = CommandSource(cfg.commands, n, spec.nominal_height_m, self.dt)
         self.foresight = Foresight(spec) if cfg.commands.foresee_falls else None
+        self.load_sense = LoadSense(spec, n, self.dt) if cfg.commands.lean_into_loads else None
         self.step_timing = (
             StepTiming(spec, n, self.dt, cfg.commands.step_correct_s) if cfg.commands.step_timing else None
         )
@@ -331,10 +334,13 @@ class H1Env(VecEnv):
         s = self.state
         turning = s.torso_angular_velocity_t
         timing, command = self.step_timing, self.commands.current()
-        lean = leaning(s.projected_gravity_t, turning)
+        if self.load_sense:
+            self.load_sense.step(s, command, self.joint_torque(s))
+        felt = self.felt
+        lean = leaning(felt.projected_gravity_t, turning)
         if self.foresight:
-            lean = self.foresight.lean(lean, s, command)
-        catch = timing.step(s, command, lean > self.commands.cfg.steady_rad) if timing else None
+            lean = self.foresight.lean(lean, felt, command)
+        catch = timing.step(felt, command, lean > self.commands.cfg.steady_rad) if timing else None
         self.commands.step(self.rng, lean, turning[:, 2], catch)
         self._follow_path()
         if self.upper_body.active:
@@ -372,9 +378,14 @@ class H1Env(VecEnv):
         velocity, yaw_rate = self.path.step(s.torso_pos_w[:, :2], s.heading_w, self.motions.root_velocity())
         self.commands.set_velocity(velocity, yaw_rate, self.path.active)
 
+    @property
+    def felt(self) -> RobotState:
+        """The state as the robot feels it: with the vertical that the loads on it ask for, if it senses loads."""
+        return self.load_sense.felt(self.state) if self.load_sense else self.state
+
     def target_from_action(self, action: torch.Tensor) -> torch.Tensor:
         """Joint targets (N, J) [rad] of actions (N, J), for the present command, gait phase and arm reference."""
-        s, reference = self.state, self.motions.current()
+        s, reference = self.felt, self.motions.current()
         return self.joint_targets(
             action, self.commands.current(), s.joint_pos, s.joint_vel, s.projected_gravity_t,
             s.torso_angular_velocity_t, reference.position + self.cfg.actions.reference_lead_s * reference.velocity,
@@ -418,10 +429,10 @@ class H1Env(VecEnv):
         """Go on exactly where `state_dict` was taken; on another kind of device or with another backend, with its own
         arithmetic and random numbers. Raises ValueError for another number of worlds."""
         self.sim.restore(Snapshot(**state["sim"]))
-        # Where the clock could not jump before, it has not jumped.
-        untimed = {"step_timing"} - state["parts"].keys()
+        # Where the clock could not jump before, it has not jumped; loads that were not sensed were none.
+        new = {"step_timing", "load_sense"} - state["parts"].keys()
         for name, part in self._parts().items():
-            if name not in untimed:
+            if name not in new:
                 part.load_state_dict(state["parts"][name])
         for name in ("delay_s", "previous", "current"):
             setattr(self.targets, name, restored(f"delay.{name}", state["delay"][name], getattr(self.targets, name)))
@@ -475,6 +486,7 @@ class H1Env(VecEnv):
             "history": self.history,
             "clean_history": self._clean_history,
             **({"step_timing": self.step_timing} if self.step_timing else {}),
+            **({"load_sense": self.load_sense} if self.load_sense else {}),
         }
 
     def _send_to_arms(self) -> None:
@@ -531,7 +543,7 @@ class H1Env(VecEnv):
             command = self.commands.current()
             error_h = torch.nn.functional.pad(command.velocity_h - s.torso_linear_velocity_h[:, :2], (0, 1))
             force, torque = assist_wrench(
-                self.cfg.assist, self._weight_n, s.torso_rotation_w[:, :, 2],
+                self.cfg.assist, self.weight_n, s.torso_rotation_w[:, :, 2],
                 rotate(s.torso_rotation_w, s.torso_angular_velocity_t), rotate(s.heading_w, error_h)[:, :2],
                 command.yaw_rate - s.yaw_rate, command.height - s.height, s.torso_linear_velocity_h[:, 2],
             )  # fmt: skip
@@ -680,6 +692,8 @@ class H1Env(VecEnv):
         self.commands.reset(mask, self.rng)
         if self.step_timing:
             self.step_timing.reset(mask)
+        if self.load_sense:
+            self.load_sense.reset(mask)
         self.motions.reset(mask, self.rng)
         self.upper_body.reset(mask, self.rng)
         self.hand_forces.reset(mask, self.rng)
@@ -714,7 +728,12 @@ class H1Env(VecEnv):
         s, seen = self.state, self.cfg.observations
         torque = self.joint_torque(s)[:, self.num_lower :]
         values = actor_values(
-            s, self.commands.current(), self.motions.current().position, self._default, self._last_action, torque
+            self.felt,
+            self.commands.current(),
+            self.motions.current().position,
+            self._default,
+            self._last_action,
+            torque,
         )
         present = self.history.scaled(values | ({"goals": self._goals()} if seen.goals else {}))
         unseen = None if seen.arm_torque == "actor" else torque

@@ -210,9 +210,10 @@ class App:
         )
 
     async def _drag(self, event: viser.SceneNodeDragEvent[Any]) -> None:
-        if event.instance_index is None:
+        index, hands = event.instance_index, len(self.session.sides)
+        if index is None or not 0 <= index < len(ROBOTS) * hands:  # no browser showing this page sends that
             return
-        robot, hand = divmod(event.instance_index, len(self.session.sides))
+        robot, hand = divmod(index, hands)
         name = f"{ROBOTS[robot]}.{self.session.sides[hand]}.drag"
         if event.phase == "start":
             self._told.discard(name)
