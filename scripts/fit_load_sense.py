@@ -57,7 +57,9 @@ class Recorder(LoadSense):
         self._true = torch.where(self._fresh.unsqueeze(1), 0.0, self._true)
         super().step(s, command, torque)
         hands_w = s.torso_pos_w.unsqueeze(1) + (s.torso_rotation_w.unsqueeze(1) @ s.arms.tip.unsqueeze(-1)).squeeze(-1)
-        tilt = load_tilt(s, hands_w, self._env.hand_force_w, self._env.weight_n)
+        # Blows are over before a robot could lean against them, and are to be told from loads.
+        struck = self._env.blows.current().any(2).any(1, keepdim=True)
+        tilt = torch.where(struck, self._true, load_tilt(s, hands_w, self._env.hand_force_w, self._env.weight_n))
         self._true = torch.lerp(self._true, torch.nan_to_num(tilt), self._tilt_share)
         self.squares.append(float((self.tilt - self._true).square().mean()))
         if self._truth:
@@ -84,6 +86,10 @@ def collect(options: argparse.Namespace) -> int:
     cfg.num_threads, cfg.commands.lean_into_loads = options.threads, True
     if options.stiffness:
         cfg.upper_body = LawOptions(method="cotap", stiffness=(options.stiffness,) * 3).configure()
+    blows = cfg.blows
+    blows.enabled, blows.force = options.blow > 0.0, (0.1 * options.blow, options.blow)
+    blows.episode_share, blows.curriculum_start = 1.0, 1.0
+    blows.curriculum_step = blows.curriculum_back = 0.0
     env = H1Env(cfg)
     recorder = Recorder(env, options.lean == "truth")
     observations = env.reset()
@@ -146,6 +152,7 @@ def main() -> int:
     pull.add_argument("--checkpoint", default="base", help="policy that drives them")
     pull.add_argument("--stiffness", type=float, default=0.0, help="arms under CoTaP at this K_ee [N/m]; 0 for PD")
     pull.add_argument("--size", type=float, default=20.0, help="largest load, per axis, on each hand [N]")
+    pull.add_argument("--blow", type=float, default=0.0, help="largest blow that comes beside loads [N]")
     pull.add_argument("--lean", choices=("truth", "sense"), default="sense", help="what robots lean by")
     pull.add_argument("--seconds", type=float, default=10.0)
     pull.add_argument("--num-envs", type=int, default=1024)

@@ -33,8 +33,10 @@ from cotap.files import require_output
 if TYPE_CHECKING:
     import numpy as np
 
-    from cotap.envs import H1Env
+    from cotap.envs import H1Env, H1EnvConfig
     from cotap.evaluation.policy import Policy
+
+LEANING = ("as-trained", "yes", "no")
 
 
 @dataclass
@@ -53,6 +55,8 @@ class CommonOptions:
     """Write the result here."""
     plot: str = ""
     """Write a plot here (PNG)."""
+    lean_into_loads: str = "as-trained"
+    """Whether robots sense what pulls at them and lean against it: yes, no, or as-trained."""
     laws: tyro.conf.OmitArgPrefixes[LawOptions] = field(default_factory=LawOptions)
 
 
@@ -193,18 +197,26 @@ def _prepare(options: CommonOptions, protocol: Any) -> tuple[H1Env, Policy, str]
     require_seed("seed", protocol.seed)
     require_range("threads", options.threads, 0, 4096)
     upper_body = options.laws.configure()
+    require_one_of("lean_into_loads", options.lean_into_loads, LEANING)
     _require_outputs(options)
     if options.threads:
         torch.set_num_threads(options.threads)
     path = _checkpoint(options)
     policy = load_policy(path)
     torch.manual_seed(protocol.seed)
-    cfg = protocol.configure(policy.env_config)
+    cfg = _leaning(options, protocol.configure(policy.env_config))
     cfg.upper_body, cfg.num_threads = upper_body, options.threads
     cfg.backend = resolve_backend(options.backend)
     env = H1Env(cfg)
     require_layout(path, policy.layout, json.loads(json.dumps(env.layout())))
     return env, policy.to(env.device), sha256(path)
+
+
+def _leaning(options: CommonOptions, env: H1EnvConfig) -> H1EnvConfig:
+    """`env` with loads sensed or not. Changes and returns `env`."""
+    if options.lean_into_loads != "as-trained":
+        env.commands.lean_into_loads = options.lean_into_loads == "yes"
+    return env
 
 
 def _checkpoint(options: CommonOptions) -> Path:
@@ -275,7 +287,7 @@ def velocity_tracking(options: VelocityTrackingOptions) -> dict[str, Any]:
         from cotap.evaluation.render import tour_video
 
         video = Path(options.video)
-        filmed = policy.env_config
+        filmed = _leaning(options, policy.env_config)
         filmed.upper_body = options.laws.configure()
         tour_video(video, filmed, policy.to("cpu"), _sheet(video))
     return result

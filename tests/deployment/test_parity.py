@@ -28,12 +28,13 @@ def laws_named(name: str) -> UpperBodyConfig:
 
 
 def batched(
-    laws: UpperBodyConfig, stand: float, seconds: float
+    laws: UpperBodyConfig, stand: float, seconds: float, leans: bool
 ) -> tuple[H1Env, list[np.ndarray], list[np.ndarray], dict]:
     """A held robot on a policy that walks in the air: its joints (T, J), torques (T, U), and how it began."""
     policy = load_policy(shipped_checkpoint("base"))
     cfg = policy.env_config
     cfg.num_envs, cfg.num_threads, cfg.fixed_base, cfg.upper_body = 1, 1, True, laws
+    cfg.commands.lean_into_loads = leans
     cfg.collision = "feet"  # as the engine below: rounding grows where legs touch
     cfg.assist.enabled = cfg.hand_forces.enabled = cfg.blows.enabled = cfg.randomization.enabled = False
     cfg.motions.clips.only, cfg.motions.clips.share = ("punch",), 1.0
@@ -59,11 +60,13 @@ def batched(
 
 # Standing is fed back for feet on the ground: in the air it oscillates, and rounding grows tenfold every 0.2 s.
 @pytest.mark.parametrize(
-    ("law", "stand", "seconds"), [("pd", 0.0, 2.0), ("cotap", 0.0, 2.0), ("mixed", 0.0, 2.0), ("pd", 1.0, 0.6)]
-)
-def test_the_loop_is_the_batched_environment(law, stand, seconds, policy, spec):
+    ("law", "stand", "seconds", "leans"),
+    [("pd", 0.0, 2.0, False), ("cotap", 0.0, 2.0, False), ("mixed", 0.0, 2.0, False), ("pd", 1.0, 0.6, False),
+     ("pd", 0.0, 2.0, True), ("cotap", 0.0, 2.0, True)],
+)  # fmt: skip
+def test_the_loop_is_the_batched_environment(law, stand, seconds, leans, policy, spec):
     laws = laws_named(law)
-    env, expected, torques, start = batched(laws, stand, seconds)
+    env, expected, torques, start = batched(laws, stand, seconds, leans)
     motion = ArmMotion(clip="punch").reference(spec, env.dt)
     engine_cfg = EngineConfig(timestep=0.01, collision="feet", cone="pyramidal")
     robot = Robot(make_engine(engine_cfg, spec), engine_cfg, spec, env.dt, Perturbations())
