@@ -17,6 +17,8 @@ from cotap.envs.load_sense import (
     COM_HEIGHT_M,
     LARGEST_TILT,
     LEAST_TILT,
+    MEAN_S,
+    TILT_S,
     LoadSense,
     TiltEstimate,
     load_features,
@@ -126,6 +128,28 @@ def test_a_restarted_world_has_no_memory(env):
     present, mean = read.split(read.shape[1] // 2, 1)
     torch.testing.assert_close(present[0], mean[0])
     assert (present[1:] != mean[1:]).any(1).all()
+
+
+def test_what_is_told_and_what_is_read_are_low_passed(env, monkeypatch):
+    """Against closed forms: after k steps of a constant, `1 - exp(-k dt / T)` of it."""
+    dt, steps = 0.02, 6
+    sense, command = LoadSense(env.spec, 4, dt), env.commands.current()
+    calm, busy = torch.zeros(4, env.num_actions), torch.full((4, env.num_actions), 50.0)
+    told = torch.tensor([[0.1, -0.05]]).expand(4, -1)
+    monkeypatch.setattr(sense, "model", lambda _: told)
+    sense.step(env.state, command, calm)  # the mean begins here
+    sense.tilt = torch.zeros(4, 2)
+    for _ in range(steps):
+        sense.step(env.state, command, busy)
+    torch.testing.assert_close(sense.tilt, told * (1.0 - math.exp(-steps * dt / TILT_S)))
+    read = sense.remember(env.state, command, busy)
+    torques = slice(9 + 2 * 19, 9 + 3 * 19)
+    present, mean = (x[:, torques] for x in read.split(read.shape[1] // 2, 1))
+    torch.testing.assert_close(mean, present * (1.0 - math.exp(-(steps + 1) * dt / MEAN_S)))
+    monkeypatch.setattr(sense, "model", lambda _: 100.0 * told)
+    for _ in range(100):
+        sense.step(env.state, command, busy)
+    torch.testing.assert_close(sense.tilt, LARGEST_TILT * told.sign())
 
 
 def test_what_a_diverged_world_says_does_not_outlast_it(env):

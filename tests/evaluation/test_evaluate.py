@@ -81,6 +81,16 @@ def test_same_seed_same_json_but_for_seconds(tmp_path: Path):
     assert first["metrics"] != other["metrics"]
 
 
+def test_robots_lean_into_loads_only_when_told_to(tmp_path: Path):
+    short = ("--num-envs", "8", "--episode-seconds", "6", "--hand-force", "20")
+    results = {how: run(tmp_path, *short, "--lean-into-loads", how, name=f"{how}.json") for how in ("yes", "no")}
+    for how, result in results.items():
+        assert result["settings"]["env"]["commands"]["lean_into_loads"] == (how == "yes")
+    as_trained = run(tmp_path, *short, name="as-trained.json")
+    assert as_trained["metrics"] == results["no"]["metrics"]
+    assert results["yes"]["metrics"] != results["no"]["metrics"]
+
+
 def test_loaded_policy_is_deterministic_and_reads_430_numbers():
     policy = load_policy(shipped_checkpoint("base"))
     obs = {"policy": torch.randn(3, 430)}
@@ -99,6 +109,7 @@ def test_loaded_policy_is_deterministic_and_reads_430_numbers():
         ([*SMALL, "--json", "no/such/folder/x.json"], "no/such/folder"),
         ([*SMALL, "--torque-limit-scale", "-1"], "torque_limit_scale"),
         ([*SMALL, "--collision", "arms"], "collision 'arms'"),
+        ([*SMALL, "--lean-into-loads", "maybe"], "known: as-trained, no, yes"),
     ],
 )
 def test_bad_input_is_named(options: list[str], says: str, capsys: pytest.CaptureFixture[str]):
