@@ -65,6 +65,22 @@ def test_a_controller_steps_where_a_fall_is_foreseen(policy, spec, falls, monkey
     assert (controller.commands.current().stand[0] < 0.5) == falls
 
 
+def test_a_controller_leans_by_what_its_sensors_read_and_starts_anew(policy, spec):
+    commands = CommandConfig(lean_into_loads=True, stand_probability=1.0)
+    controller = Controller(policy, spec, UpperBodyConfig(), commands, ArmMotion().reference(spec, 0.02), seed=0)
+    robot = make_robot(spec)
+    start_up(robot, controller, SafetyConfig(ramp_s=0.0), 0)
+    sense = controller._load_sense
+    assert sense is not None
+    for _ in range(3):
+        robot.act(controller.step(robot.read()), FREE)
+    assert sense.tilt.isfinite().all()
+    assert sense.tilt.norm() > 0.0
+    controller.restart()
+    assert sense.tilt.norm() == 0.0
+    assert sense._fresh.all()
+
+
 @pytest.fixture
 def default(spec):
     return np.array([j.default_rad for j in spec.joints])

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from cotap.agents.actors import as_dict
-from cotap.envs import H1Env, H1EnvConfig, load_sense
+from cotap.envs import H1Env, H1EnvConfig, h1_env, load_sense
 from cotap.envs.load_sense import (
     COM_HEIGHT_M,
     LARGEST_TILT,
@@ -177,6 +177,39 @@ def test_policy_and_joint_targets_see_the_tilted_vertical_and_rewards_the_true_o
     sent = env.target_from_action(torch.zeros(4, env.num_actions))
     env.load_sense.tilt = torch.zeros(4, 2)
     assert (env.target_from_action(torch.zeros(4, env.num_actions)) != sent).any()
+
+
+def test_all_that_keeps_balance_goes_by_the_tilted_vertical(monkeypatch):
+    cfg = H1EnvConfig(num_envs=2, num_threads=1)
+    cfg.commands.lean_into_loads = cfg.commands.step_timing = cfg.commands.foresee_falls = True
+    env = H1Env(cfg)
+    env.reset()
+    sense, timing, foresight = env.load_sense, env.step_timing, env.foresight
+    assert sense is not None
+    assert timing is not None
+    assert foresight is not None
+    tilt = torch.tensor([[0.1, 0.0], [0.0, 0.1]])
+    seen, real_lean, real_timing, real_foresight = {}, h1_env.leaning, timing.step, foresight.lean
+    monkeypatch.setattr(sense, "step", lambda *_: setattr(sense, "tilt", tilt.clone()))
+    monkeypatch.setattr(h1_env, "leaning", lambda g, w: seen.setdefault("lean", g) is None or real_lean(g, w))
+    monkeypatch.setattr(
+        timing, "step", lambda s, *rest: seen.update(timing=s.projected_gravity_t) or real_timing(s, *rest)
+    )
+    monkeypatch.setattr(
+        foresight, "lean", lambda x, s, c: seen.update(foresight=s.projected_gravity_t) or real_foresight(x, s, c)
+    )
+    env.step(torch.zeros(2, env.num_actions))
+    assert seen.keys() == {"lean", "timing", "foresight"}
+    for gravity in seen.values():
+        torch.testing.assert_close(gravity, env.felt.projected_gravity_t)
+        assert (gravity != env.state.projected_gravity_t).any(1).all()
+
+
+def test_an_environment_that_restarts_senses_anew(env):
+    env.load_sense.tilt = torch.full((4, 2), 0.1)
+    env.reset()
+    assert env.load_sense.tilt.tolist() == [[0.0, 0.0]] * 4
+    assert env.load_sense._fresh.all()
 
 
 def test_it_goes_on_exactly_where_it_was_saved(env):

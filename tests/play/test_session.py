@@ -31,6 +31,11 @@ def test_robots_start_alike_face_forward_and_stay_alike_under_the_same_push(sess
     np.testing.assert_allclose(run(session, 25)[-1]["qpos"], samples[-1]["qpos"], atol=1e-6)
 
 
+def test_of_a_policy_that_leans_into_loads_otherwise_people_are_told(session, monkeypatch):
+    monkeypatch.setattr(session.env.cfg.commands, "lean_into_loads", True)
+    assert session.trained_otherwise("base") == "base was trained with lean_into_loads False (here True)"
+
+
 def test_law_and_stiffness_are_set_per_robot_and_arm(session):
     assert session.set({"a.left.law": "pd", "b.right.stiffness_z": 900.0, "b.right.alpha": 0.5}) == []
     sample = run(session, 3)[-1]
