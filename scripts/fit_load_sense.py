@@ -56,10 +56,9 @@ class Recorder(LoadSense):
         """Sense and write down. Arguments as of `LoadSense.step`."""
         self._true = torch.where(self._fresh.unsqueeze(1), 0.0, self._true)
         super().step(s, command, torque)
-        hands_w = s.torso_pos_w.unsqueeze(1) + (s.torso_rotation_w.unsqueeze(1) @ s.arms.tip.unsqueeze(-1)).squeeze(-1)
         # Blows are over before a robot could lean against them, and are to be told from loads.
         struck = self._env.blows.current().any(2).any(1, keepdim=True)
-        tilt = torch.where(struck, self._true, load_tilt(s, hands_w, self._env.hand_force_w, self._env.weight_n))
+        tilt = torch.where(struck, self._true, load_tilt(s, s.hand_pos_w, self._env.hand_force_w, self._env.weight_n))
         self._true = torch.lerp(self._true, torch.nan_to_num(tilt), self._tilt_share)
         self.squares.append(float((self.tilt - self._true).square().mean()))
         if self._truth:

@@ -728,13 +728,9 @@ class H1Env(VecEnv):
         s, seen = self.state, self.cfg.observations
         torque = self.joint_torque(s)[:, self.num_lower :]
         values = actor_values(
-            self.felt,
-            self.commands.current(),
-            self.motions.current().position,
-            self._default,
-            self._last_action,
+            self.felt, self.commands.current(), self.motions.current().position, self._default, self._last_action,
             torque,
-        )
+        )  # fmt: skip
         present = self.history.scaled(values | ({"goals": self._goals()} if seen.goals else {}))
         unseen = None if seen.arm_torque == "actor" else torque
         groups = {"privileged": self._privileged(s, unseen) * self._critic_scale}

@@ -67,6 +67,11 @@ class RobotState:
         """(N,) height of the torso link's origin above the ground [m]."""
         return self.torso_pos_w[:, 2]
 
+    @property
+    def hand_pos_w(self) -> torch.Tensor:
+        """(N, A, 3) where the hand points are [m]."""
+        return self.torso_pos_w.unsqueeze(1) + self.arms.tip @ self.torso_rotation_w.transpose(1, 2)
+
     def with_worlds(self, ids: torch.Tensor, other: RobotState) -> RobotState:
         """A copy in which the worlds `ids` (n,) are in the state of `other`, which has n worlds."""
         return _with_rows(self, ids, other)

@@ -164,21 +164,15 @@ def exchanged_energy(env: H1Env, protocol: Stability) -> torch.Tensor:
             draw = uniform(rng, -0.5, 0.5, *stiffness.shape).to(env.device)
             changed = stiffness * protocol.change_factor**draw
             env.upper_body.parameters.stiffness = torch.where(changing[:, None, None], changed, stiffness)
-        before = _hands_w(env)
+        before = env.state.hand_pos_w
         _, _, _, extras = env.step(action)
-        work = (env.hand_force_w * (_hands_w(env) - before)).sum((1, 2))
+        work = (env.hand_force_w * (env.state.hand_pos_w - before)).sum((1, 2))
         # Where a world has diverged it has been restarted: it has given all that can be.
         work = torch.where(extras["falls"], torch.full_like(work, -math.inf), work)
         energy = energy + torch.nan_to_num(work, nan=-math.inf, posinf=-math.inf)
         if step >= settle:
             rows.append(energy.clone())
     return torch.stack(rows).cpu()
-
-
-def _hands_w(env: H1Env) -> torch.Tensor:
-    """(N, H, 3) [m]."""
-    s = env.state
-    return s.torso_pos_w.unsqueeze(1) + s.arms.tip @ s.torso_rotation_w.transpose(1, 2)
 
 
 def energy_summary(energy: torch.Tensor) -> dict[str, Any]:

@@ -67,5 +67,4 @@ def _hands_w(env: H1Env, reference: torch.Tensor) -> tuple[torch.Tensor, torch.T
     """Hands and their references (W, H, 3) in the world; the reference is carried in the torso frame."""
     s = env.record.state
     wanted = env.reader.arm_chains.pose(reference.unflatten(1, (len(env.spec.arms), -1))).tip
-    place = [s.torso_pos_w.unsqueeze(1) + p @ s.torso_rotation_w.transpose(1, 2) for p in (s.arms.tip, wanted)]
-    return place[0], place[1]
+    return s.hand_pos_w, s.torso_pos_w.unsqueeze(1) + wanted @ s.torso_rotation_w.transpose(1, 2)

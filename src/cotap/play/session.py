@@ -121,8 +121,7 @@ class Session:
         """Advance by one control step."""
         env = self.env
         s = env.state
-        hands = s.torso_pos_w.unsqueeze(1) + s.arms.tip @ s.torso_rotation_w.transpose(1, 2)
-        force_h = self.loads.step(hands, s.heading_w)
+        force_h = self.loads.step(s.hand_pos_w, s.heading_w)
         env.scripted.amplitude_h[:, :-1] = force_h
         self._observations, _, done, extras = env.step(self._act())
         self.num_steps += 1
