@@ -57,6 +57,9 @@ class CommonOptions:
     """Write a plot here (PNG)."""
     lean_into_loads: str = "as-trained"
     """Whether robots sense what pulls at them and lean against it: yes, no, or as-trained."""
+    brace_tilt_rad: float | None = None
+    """Tilt that loads ask for from which robots that lean against them stop and stand [rad]; 0 for never; as trained
+    unless given."""
     laws: tyro.conf.OmitArgPrefixes[LawOptions] = field(default_factory=LawOptions)
 
 
@@ -213,9 +216,14 @@ def _prepare(options: CommonOptions, protocol: Any) -> tuple[H1Env, Policy, str]
 
 
 def _leaning(options: CommonOptions, env: H1EnvConfig) -> H1EnvConfig:
-    """`env` with loads sensed or not. Changes and returns `env`."""
+    """`env` with loads sensed and braced against or not. Changes and returns `env`."""
+    commands = env.commands
     if options.lean_into_loads != "as-trained":
-        env.commands.lean_into_loads = options.lean_into_loads == "yes"
+        commands.lean_into_loads = options.lean_into_loads == "yes"
+    if options.brace_tilt_rad is not None:
+        commands.brace_tilt_rad = options.brace_tilt_rad
+    elif not commands.lean_into_loads:
+        commands.brace_tilt_rad = 0.0  # what is not sensed is not braced against
     return env
 
 

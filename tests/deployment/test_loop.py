@@ -81,6 +81,22 @@ def test_a_controller_leans_by_what_its_sensors_read_and_starts_anew(policy, spe
     assert sense._fresh.all()
 
 
+@pytest.mark.parametrize("braces", [False, True])
+def test_a_controller_braces_itself_against_what_pulls(policy, spec, braces, monkeypatch):
+    commands = CommandConfig(lean_into_loads=True, brace_tilt_rad=0.03)
+    controller = Controller(policy, spec, UpperBodyConfig(), commands, ArmMotion().reference(spec, 0.02), seed=0)
+    controller.commands.override(torch.tensor([[0.5, 0.0]]), torch.zeros(1), torch.zeros(1), torch.ones(1))
+    robot = make_robot(spec)
+    start_up(robot, controller, SafetyConfig(ramp_s=0.0), 0)
+    sense = controller._load_sense
+    assert sense is not None
+    assert sense._brace_rad == 0.03
+    monkeypatch.setattr(sense, "step", lambda *_: setattr(sense, "braces", torch.tensor([braces])))
+    for _ in range(11):  # the first fills the history
+        robot.act(controller.step(robot.read()), FREE)
+    assert float(controller.commands.current().velocity_h[0, 0]) == pytest.approx(0.0 if braces else 0.3, abs=1e-5)
+
+
 @pytest.fixture
 def default(spec):
     return np.array([j.default_rad for j in spec.joints])

@@ -174,6 +174,42 @@ def test_a_standing_robot_that_leans_steps_until_it_is_steady(rng):
     assert float(walking.current().stand) == 0.0
 
 
+def test_a_robot_that_braces_itself_stops_and_stands_and_then_goes_on(rng):
+    """Beside one that does not: both were told to walk, at 0.9 m/s that take 0.6 s to lose."""
+    commands = source(2, resample_s=(100.0, 100.0))
+    velocity, turn = torch.tensor([[0.9, 0.0]] * 2), torch.tensor([0.6, 0.6])
+    commands.override(velocity, turn, torch.zeros(2), torch.full((2,), NOMINAL))
+    commands.reset(everyone(2), rng)
+    for _ in range(100):
+        commands.step(rng)
+    torch.testing.assert_close(commands.current().velocity_h, velocity)
+    braces, seen = torch.tensor([True, False]), []
+    for _ in range(60):
+        commands.step(rng, braces=braces)
+        seen.append(commands.current())
+    assert float(seen[14].velocity_h[0, 0]) == pytest.approx(0.9 - 15 * 1.5 * DT, abs=1e-5)
+    stood = torch.stack([c.stand for c in seen])
+    assert not stood[:30].any()  # it slows down and ends its step first
+    assert stood[-1].tolist() == [1.0, 0.0]
+    assert float(seen[-1].phase[0]) in (0.0, 0.5)
+    assert seen[-1].velocity_h[0].tolist() == [0.0, 0.0]
+    assert seen[-1].yaw_rate[0] == 0.0
+    torch.testing.assert_close(seen[-1].velocity_h[1], velocity[1])
+    assert not commands.told_to_stand.any()  # that is what was drawn
+    commands.step(rng, lean=torch.tensor([math.inf, 0.0]), braces=braces)
+    assert commands.current().stand[0] == 0.0  # it still steps for its balance
+    for _ in range(40):
+        commands.step(rng, braces=torch.tensor([False, False]))
+    torch.testing.assert_close(commands.current().velocity_h, velocity)
+    assert commands.current().stand.tolist() == [0.0, 0.0]
+
+
+def test_bracing_without_sensing_is_refused():
+    with pytest.raises(ValueError, match=r"brace_tilt_rad is 0\.04.*lean_into_loads"):
+        CommandConfig(brace_tilt_rad=0.04).check()
+    CommandConfig(brace_tilt_rad=0.04, lean_into_loads=True).check()
+
+
 @pytest.mark.parametrize("rest", [0.0, 0.5])
 def test_balance_is_caught_with_the_foot_that_the_turn_carries_forward(rng, rest):
     commands = source(4, steady_rad=0.2)

@@ -18,6 +18,7 @@ from cotap.envs.load_sense import (
     LARGEST_TILT,
     LEAST_TILT,
     MEAN_S,
+    RELEASE,
     TILT_S,
     LoadSense,
     TiltEstimate,
@@ -152,6 +153,44 @@ def test_what_is_told_and_what_is_read_are_low_passed(env, monkeypatch):
     torch.testing.assert_close(sense.tilt, LARGEST_TILT * told.sign())
 
 
+def test_a_robot_braces_itself_from_one_tilt_on_until_well_below_it(env, monkeypatch):
+    sense, command, torque = LoadSense(env.spec, 4, 0.02, 0.05), env.commands.current(), torch.zeros(4, env.num_actions)
+    monkeypatch.setattr(sense, "model", lambda _: told)
+    told, braced = torch.zeros(4, 2), []
+    between = 0.05 * 0.5 * (1.0 + RELEASE)
+    for size in (between, 0.06, between, 0.9 * RELEASE * 0.05, between):
+        told = size * torch.tensor([[1.0, 0.0], [0.0, -1.0], [0.6, 0.8], [0.0, 0.0]])
+        for _ in range(100):  # whatever is told is low-passed
+            sense.step(env.state, command, torque)
+        braced.append(sense.braces.tolist())
+    no, yes = [False] * 4, [True, True, True, False]
+    assert braced == [no, yes, yes, no, no]
+    sense.braces = torch.ones(4, dtype=torch.bool)
+    sense.reset(torch.tensor([True, False, False, False]))
+    assert sense.braces.tolist() == [False, True, True, True]
+    never = LoadSense(env.spec, 4, 0.02)
+    monkeypatch.setattr(never, "model", lambda _: torch.full((4, 2), LARGEST_TILT))
+    for _ in range(100):
+        never.step(env.state, command, torque)
+    assert not never.braces.any()
+
+
+def test_robots_that_are_pulled_at_brace_themselves(monkeypatch):
+    """Told to walk, one of two stops, since its load sense says so."""
+    cfg = H1EnvConfig(num_envs=2, num_threads=1)
+    cfg.commands.lean_into_loads, cfg.commands.brace_tilt_rad = True, 0.03
+    env = H1Env(cfg)
+    env.commands.override(torch.tensor([[0.5, 0.0]] * 2), torch.zeros(2), torch.zeros(2), torch.ones(2))
+    env.reset()
+    sense = env.load_sense
+    assert sense is not None
+    assert sense._brace_rad == 0.03
+    monkeypatch.setattr(sense, "step", lambda *_: setattr(sense, "braces", torch.tensor([True, False])))
+    for _ in range(10):
+        env.step(torch.zeros(2, env.num_actions))
+    torch.testing.assert_close(env.commands.current().velocity_h[:, 0], torch.tensor([0.0, 0.3]))
+
+
 def test_what_a_diverged_world_says_does_not_outlast_it(env):
     sense, command = LoadSense(env.spec, 4, 0.02), env.commands.current()
     bad = env.state.joint_vel.clone()
@@ -222,6 +261,10 @@ def test_it_goes_on_exactly_where_it_was_saved(env):
     env.load_state_dict(saved)
     for present in expected:
         torch.testing.assert_close(env.step(action)[0]["policy"], present, rtol=0.0, atol=0.0)
+    del saved["parts"]["load_sense"]["braces"]  # of a run before robots braced themselves
+    env.load_sense.braces = torch.ones(4, dtype=torch.bool)
+    env.load_state_dict(saved)
+    assert not env.load_sense.braces.any()
     del saved["parts"]["load_sense"]  # of a run before there was such a thing
     env.load_state_dict(saved)
 

@@ -5,10 +5,12 @@ from pathlib import Path
 
 import pytest
 import torch
+import tyro
 
 from cotap.agents.checkpoint import load_checkpoint, save_checkpoint, sha256
 from cotap.configs import to_plain
-from cotap.evaluate import main
+from cotap.envs import H1EnvConfig
+from cotap.evaluate import VelocityTrackingOptions, _leaning, main
 from cotap.evaluation import policy
 from cotap.evaluation.policy import load_policy, shipped_checkpoint, shipped_names
 from cotap.evaluation.render import RenderingUnavailable, open_renderer
@@ -91,6 +93,20 @@ def test_robots_lean_into_loads_only_when_told_to(tmp_path: Path):
     assert results["yes"]["metrics"] != results["no"]["metrics"]
 
 
+@pytest.mark.parametrize(
+    ("options", "leans", "tilt"),
+    [((), True, 0.04), (("--lean-into-loads", "no"), False, 0.0), (("--brace-tilt-rad", "0"), True, 0.0),
+     (("--lean-into-loads", "yes", "--brace-tilt-rad", "0.06"), True, 0.06)],
+)  # fmt: skip
+def test_robots_brace_themselves_as_trained_unless_told_otherwise(options, leans, tilt):
+    trained = H1EnvConfig()
+    trained.commands.lean_into_loads, trained.commands.brace_tilt_rad = True, 0.04
+    parsed = tyro.cli(VelocityTrackingOptions, args=list(options))
+    commands = _leaning(parsed, trained).commands
+    assert (commands.lean_into_loads, commands.brace_tilt_rad) == (leans, tilt)
+    commands.check()
+
+
 def test_loaded_policy_is_deterministic_and_reads_430_numbers():
     policy = load_policy(shipped_checkpoint("base"))
     obs = {"policy": torch.randn(3, 430)}
@@ -110,6 +126,7 @@ def test_loaded_policy_is_deterministic_and_reads_430_numbers():
         ([*SMALL, "--torque-limit-scale", "-1"], "torque_limit_scale"),
         ([*SMALL, "--collision", "arms"], "collision 'arms'"),
         ([*SMALL, "--lean-into-loads", "maybe"], "known: as-trained, no, yes"),
+        ([*SMALL, "--lean-into-loads", "no", "--brace-tilt-rad", "0.04"], "brace_tilt_rad is 0.04"),
     ],
 )
 def test_bad_input_is_named(options: list[str], says: str, capsys: pytest.CaptureFixture[str]):

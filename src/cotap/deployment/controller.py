@@ -122,7 +122,7 @@ class Controller:
         self._everyone = torch.ones(1, dtype=torch.bool)
         self.commands = CommandSource(commands, 1, spec.nominal_height_m, self.dt)
         self._foresight = Foresight(spec) if commands.foresee_falls else None
-        self._load_sense = LoadSense(spec, 1, self.dt) if commands.lean_into_loads else None
+        self._load_sense = LoadSense(spec, 1, self.dt, commands.brace_tilt_rad) if commands.lean_into_loads else None
         self._timing = StepTiming(spec, 1, self.dt, commands.step_correct_s) if commands.step_timing else None
         self.motion = motion
         self.upper_body = UpperBody(laws, spec, 1, self.dt, torch.float64)
@@ -168,7 +168,8 @@ class Controller:
             if self._foresight:
                 lean = self._foresight.lean(lean, s, command)
             catch = self._timing.step(s, command, lean > self.commands.cfg.steady_rad) if self._timing else None
-            self.commands.step(self._rng, lean.float(), turning[:, 2].float(), catch)
+            braces = self._load_sense.braces if self._load_sense else None
+            self.commands.step(self._rng, lean.float(), turning[:, 2].float(), catch, braces)
             self.upper_body.step(self.dt, self._rng)
         observed = self.motion.current().position
         values = actor_values(

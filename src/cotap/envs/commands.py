@@ -73,6 +73,9 @@ class CommandConfig:
     from `steady_rad` on."""
     lean_into_loads: bool = False
     """Whether the vertical that steps, standing and policy go by is tilted by what pulls at the robot (`LoadSense`)."""
+    brace_tilt_rad: float = 0.0
+    """Tilt that loads ask for from which a robot that senses them stops and stands, whatever its command, until they
+    are less [rad]; 0 for never."""
     step_timing: bool = False
     """Whether the gait clock jumps to where a robot that was struck catches itself (`StepTiming`)."""
     step_correct_s: float = 0.0
@@ -100,6 +103,12 @@ class CommandConfig:
         require_range("commands.waist_yield_s", self.waist_yield_s, 0.0, 1.0)
         require_range("commands.waist_damping_s", self.waist_damping_s, 0.0, 0.2)
         require_range("commands.step_correct_s", self.step_correct_s, 0.0, 1.0)
+        require_range("commands.brace_tilt_rad", self.brace_tilt_rad, 0.0, 1.0)
+        if self.brace_tilt_rad > 0.0 and not self.lean_into_loads:
+            raise ValueError(
+                f"commands.brace_tilt_rad is {self.brace_tilt_rad:g}, but robots that do not lean into loads "
+                "(commands.lean_into_loads) do not sense them: it must be 0"
+            )
 
 
 @dataclass(frozen=True)
@@ -135,7 +144,7 @@ class CommandSource(Stateful):
 
     What is commanded approaches what was drawn at limited rates, as a pilot's stick does. A robot told to stand slows
     down, ends its step, and stands: the stand flag is raised once the velocity command is zero and both feet are down,
-    and lowered, for a step or more, when it loses its balance.
+    and lowered, for a step or more, when it loses its balance. One that braces itself does so whatever it is told.
     A velocity source (such as the torso-position impedance) may replace the velocities at every step.
     """
 
@@ -190,7 +199,7 @@ class CommandSource(Stateful):
 
     def step(
         self, rng: torch.Generator, lean: torch.Tensor | None = None, turning: torch.Tensor | None = None,
-        catch: Catch | None = None,
+        catch: Catch | None = None, braces: torch.Tensor | None = None,
     ) -> None:  # fmt: skip
         """Advance clocks by one control step and resample what is due.
 
@@ -199,6 +208,7 @@ class CommandSource(Stateful):
             lean: (N,) how far each robot is about to lean [rad], from `leaning`; None counts as upright.
             turning: (N,) how fast each robot turns, positive to the left [rad/s]; None counts as not at all.
             catch: Where the clock jumps, and who hurries; None leaves that to `turning`.
+            braces: (N,) bool, who stops and stands whatever was drawn; None for nobody.
         """
         self._remaining_s -= self._dt
         self._draw(self._remaining_s <= 0.0, rng)
@@ -206,7 +216,10 @@ class CommandSource(Stateful):
         # Stepping is done at nominal height.
         wanted = torch.where(self._stand > 0.5, self._target[:, 4], self._target[:, 4].clamp_min(self._nominal))
         self._height = self._height + (wanted - self._height).clamp(-limit, limit)
-        self._velocity = self._velocity + (self._target[:, :3] - self._velocity).clamp(-self._rate, self._rate)
+        to_stand, velocity = self.told_to_stand, self._target[:, :3]
+        if braces is not None:
+            to_stand, velocity = to_stand | braces, velocity.masked_fill(braces.unsqueeze(1), 0.0)
+        self._velocity = self._velocity + (velocity - self._velocity).clamp(-self._rate, self._rate)
         nothing = torch.zeros_like(self._phase)
         lean, turning = nothing if lean is None else lean, nothing if turning is None else turning
         rate = torch.full_like(self._phase, self._dt / self.cfg.gait_period_s)
@@ -216,7 +229,7 @@ class CommandSource(Stateful):
             self._phase = torch.where(catch.jumps, catch.phase, self._phase)
             self._stand = torch.where(catch.jumps, 0.0, self._stand)
             rate = torch.where(catch.hurries, HURRY * rate, rate)
-        self._advance_gait(lean <= self.cfg.steady_rad, rate)
+        self._advance_gait(to_stand, lean <= self.cfg.steady_rad, rate)
 
     def _choose_foot(self, lean: torch.Tensor, turning: torch.Tensor) -> None:
         """A standing robot that steps for its balance while it is being turned begins with the foot that the turn
@@ -226,12 +239,12 @@ class CommandSource(Stateful):
         catches = (self._stand > 0.5) & leans & (turning.abs() > TURNED_RAD_S)
         self._phase = torch.where(catches, 0.5 * (turning < 0.0), self._phase)
 
-    def _advance_gait(self, steady: torch.Tensor, rate: torch.Tensor) -> None:
+    def _advance_gait(self, to_stand: torch.Tensor, steady: torch.Tensor, rate: torch.Tensor) -> None:
         """Run the clock while walking; come to rest at the next double support, 0 or 0.5, once asked to and steady."""
         half_strides = 2.0 * (self._phase + rate)
         both_down = half_strides.floor() > (2.0 * self._phase).floor()
-        at_rest = (self._velocity == 0.0).all(1) & (self._target[:, 3] > 0.5) & steady
-        stays = (self._stand > 0.5) & (self._target[:, 3] > 0.5) & steady
+        at_rest = (self._velocity == 0.0).all(1) & to_stand & steady
+        stays = (self._stand > 0.5) & to_stand & steady
         stops = ~stays & at_rest & both_down
         running = 0.5 * torch.where(stops, half_strides.floor(), half_strides)
         self._phase = torch.where(stays, self._phase, running.remainder(1.0))

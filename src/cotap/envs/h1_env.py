@@ -208,7 +208,9 @@ class H1Env(VecEnv):
 
         self.commands = CommandSource(cfg.commands, n, spec.nominal_height_m, self.dt)
         self.foresight = Foresight(spec) if cfg.commands.foresee_falls else None
-        self.load_sense = LoadSense(spec, n, self.dt) if cfg.commands.lean_into_loads else None
+        self.load_sense = (
+            LoadSense(spec, n, self.dt, cfg.commands.brace_tilt_rad) if cfg.commands.lean_into_loads else None
+        )
         self.step_timing = (
             StepTiming(spec, n, self.dt, cfg.commands.step_correct_s) if cfg.commands.step_timing else None
         )
@@ -341,7 +343,8 @@ class H1Env(VecEnv):
         if self.foresight:
             lean = self.foresight.lean(lean, felt, command)
         catch = timing.step(felt, command, lean > self.commands.cfg.steady_rad) if timing else None
-        self.commands.step(self.rng, lean, turning[:, 2], catch)
+        braces = self.load_sense.braces if self.load_sense else None
+        self.commands.step(self.rng, lean, turning[:, 2], catch, braces)
         self._follow_path()
         if self.upper_body.active:
             self.upper_body.sense(s, self._hand_force_w, self._arm_effort)

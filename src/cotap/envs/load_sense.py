@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 import torch
 from torch import nn
@@ -35,6 +36,9 @@ LEAST_TILT = 0.01
 """Robots lean by this much less than they are told, or not at all: no estimate is exact, and most often nothing pulls
 [rad]."""
 HIDDEN = (128, 64)
+RELEASE = 0.6
+"""A robot braces itself until the tilt is less than this share of what made it: loads that hardly do must not make it
+stop and go."""
 
 
 def load_tilt(s: RobotState, points_w: torch.Tensor, force_w: torch.Tensor, weight_n: float) -> torch.Tensor:
@@ -99,14 +103,16 @@ class LoadSense(Stateful):
         spec: The robot.
         num_envs: Number of worlds.
         dt: Control step [s].
+        brace_rad: Tilt from which a robot braces itself; 0 for never [rad].
 
     Raises:
         ValueError: the shipped weights are for another number of joints.
     """
 
-    STATE = ("_mean", "_fresh", "tilt")
+    STATE = ("_mean", "_fresh", "tilt", "braces")
 
-    def __init__(self, spec: RobotSpec, num_envs: int, dt: float) -> None:
+    def __init__(self, spec: RobotSpec, num_envs: int, dt: float, brace_rad: float = 0.0) -> None:
+        self._brace_rad = brace_rad or math.inf
         self._default = torch.tensor([j.default_rad for j in spec.joints])
         self.model = TiltEstimate(load_reflection(spec)).eval()
         load_shipped(self.model.net, "load_sense.npz", "load sense", spec)
@@ -115,10 +121,17 @@ class LoadSense(Stateful):
         self._fresh = torch.ones(num_envs, dtype=torch.bool)
         self.tilt = torch.zeros(num_envs, 2)
         """(N, 2) along x and y of the torso frame [rad]."""
+        self.braces = torch.zeros(num_envs, dtype=torch.bool)
+        """(N,) who is pulled at so hard that it should stop and stand."""
 
     def reset(self, mask: torch.Tensor) -> None:
         """Worlds of `mask` (N,) start with nothing that pulls at them."""
         self._fresh, self.tilt = self._fresh | mask, self.tilt.masked_fill(mask.unsqueeze(1), 0.0)
+        self.braces = self.braces & ~mask
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """As of any `Stateful`; in states that were saved before robots braced themselves, none does."""
+        super().load_state_dict({"braces": torch.zeros_like(self.braces), **state})
 
     @torch.no_grad()
     def step(self, s: RobotState, command: Command, torque: torch.Tensor) -> None:
@@ -131,6 +144,8 @@ class LoadSense(Stateful):
         """
         told = self.model(self.remember(s, command, torque)).clamp(-LARGEST_TILT, LARGEST_TILT)
         self.tilt = torch.lerp(self.tilt, told, self._tilt_share)
+        size = self.tilt.norm(dim=1)
+        self.braces = torch.where(self.braces, size > RELEASE * self._brace_rad, size > self._brace_rad)
 
     def remember(self, s: RobotState, command: Command, torque: torch.Tensor) -> torch.Tensor:
         """Take the present into the mean; what the network reads then, (N, 2 W). Arguments as of `step`."""

@@ -26,7 +26,7 @@ from cotap.play.sample import Sample, take_sample
 GAIT = (
     "gait_period_s", "step_apart_m", "step_clear_m", "step_hold_back_m", "step_catch_lift",
     "step_roll_damping_s", "step_twist_damping_s", "step_straighten_rad", "waist_yield_s", "waist_damping_s",
-    "step_timing", "step_correct_s", "foresee_falls", "lean_into_loads",
+    "step_timing", "step_correct_s", "foresee_falls", "lean_into_loads", "brace_tilt_rad",
 )  # fmt: skip
 """Fields of `CommandConfig` that shape what is fed forward to legs and waist."""
 
