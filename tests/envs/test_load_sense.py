@@ -175,6 +175,17 @@ def test_a_robot_braces_itself_from_one_tilt_on_until_well_below_it(env, monkeyp
     assert not never.braces.any()
 
 
+def test_who_is_not_awake_senses_nothing(env, monkeypatch):
+    sense, command = LoadSense(env.spec, 4, 0.02, 0.05), env.commands.current()
+    monkeypatch.setattr(sense, "model", lambda _: torch.full((4, 2), 0.1))
+    sense.awake = torch.tensor([True, False, True, True])
+    for _ in range(100):
+        sense.step(env.state, command, torch.zeros(4, env.num_actions))
+    assert sense.tilt[1].tolist() == [0.0, 0.0]
+    torch.testing.assert_close(sense.tilt[[0, 2, 3]], torch.full((3, 2), 0.1))
+    assert sense.braces.tolist() == [True, False, True, True]
+
+
 def test_robots_that_are_pulled_at_brace_themselves(monkeypatch):
     """Told to walk, one of two stops, since its load sense says so."""
     cfg = H1EnvConfig(num_envs=2, num_threads=1)

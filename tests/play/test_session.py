@@ -31,9 +31,26 @@ def test_robots_start_alike_face_forward_and_stay_alike_under_the_same_push(sess
     np.testing.assert_allclose(run(session, 25)[-1]["qpos"], samples[-1]["qpos"], atol=1e-6)
 
 
-def test_of_a_policy_that_leans_into_loads_otherwise_people_are_told(session, monkeypatch):
-    monkeypatch.setattr(session.env.cfg.commands, "lean_into_loads", True)
-    assert session.trained_otherwise("base") == "base was trained with lean_into_loads False (here True)"
+def test_of_a_policy_that_foresees_falls_otherwise_people_are_told(session, monkeypatch):
+    monkeypatch.setattr(session.env.cfg.commands, "foresee_falls", False)
+    assert session.trained_otherwise("base") == "base was trained with foresee_falls True (here False)"
+
+
+def test_one_robot_leans_against_what_pulls_at_both_and_stops_for_it(session):
+    """Both walk and both hands are pulled back: the tilt of 24 N at 1.1 m is 0.06 rad, enough to brace for."""
+    pull = {f"held.{side}.x": -12.0 for side in ("left", "right")}
+    session.set({"stand": False, "velocity_x": 0.4, "b.senses_loads": True} | pull)
+    samples = run(session, 150)
+    sense, command = session.env.load_sense, session.env.commands.current()
+    assert sense.tilt[0].norm() == 0.0
+    assert -0.12 < float(sense.tilt[1, 0]) < -0.03
+    assert sense.braces.tolist() == [False, True]
+    assert command.velocity_h[:, 0].tolist() == pytest.approx([0.4, 0.0])
+    assert not any(s["fell"].any() for s in samples)
+    session.set({"b.senses_loads": False})
+    run(session, 50)
+    assert sense.tilt[1].norm() < 1e-3
+    assert session.env.commands.current().velocity_h[:, 0].tolist() == pytest.approx([0.4, 0.4])
 
 
 def test_law_and_stiffness_are_set_per_robot_and_arm(session):

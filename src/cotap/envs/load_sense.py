@@ -123,6 +123,8 @@ class LoadSense(Stateful):
         """(N, 2) along x and y of the torso frame [rad]."""
         self.braces = torch.zeros(num_envs, dtype=torch.bool)
         """(N,) who is pulled at so hard that it should stop and stand."""
+        self.awake = torch.ones(num_envs, dtype=torch.bool)
+        """(N,) whose loads are sensed at all; the others stay upright, and go on."""
 
     def reset(self, mask: torch.Tensor) -> None:
         """Worlds of `mask` (N,) start with nothing that pulls at them."""
@@ -143,6 +145,7 @@ class LoadSense(Stateful):
             torque: (N, J) of the motors, as computed [Nm].
         """
         told = self.model(self.remember(s, command, torque)).clamp(-LARGEST_TILT, LARGEST_TILT)
+        told = told.masked_fill(~self.awake.unsqueeze(1), 0.0)
         self.tilt = torch.lerp(self.tilt, told, self._tilt_share)
         size = self.tilt.norm(dim=1)
         self.braces = torch.where(self.braces, size > RELEASE * self._brace_rad, size > self._brace_rad)

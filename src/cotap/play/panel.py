@@ -140,6 +140,10 @@ class Panel:
             for side in self._sides:
                 for axis in AXES:
                     self.bind(f"held.{side}.{axis}")
+        for robot in ROBOTS:
+            handle = self.bind(f"{robot}.senses_loads")
+            if robot != ROBOTS[0]:
+                self._second.append(handle)
         self._gui.add_markdown("Drag an orange ball with the mouse: a spring pulls that hand after it.")
 
     def _push(self, direction: tuple[float, float, float]) -> Push:

@@ -14,7 +14,7 @@ from cotap.agents.actors import as_dict
 from cotap.agents.checkpoint import require_layout, sha256
 from cotap.compliance.laws import LAWS, LawConfig
 from cotap.envs import H1Env, H1EnvConfig
-from cotap.envs.commands import STEADY_RAD
+from cotap.envs.commands import BRACE_TILT_RAD, STEADY_RAD
 from cotap.envs.reference import REST
 from cotap.evaluation.policy import Policy, load_policy
 from cotap.evaluation.quiet import quiet
@@ -26,9 +26,11 @@ from cotap.play.sample import Sample, take_sample
 GAIT = (
     "gait_period_s", "step_apart_m", "step_clear_m", "step_hold_back_m", "step_catch_lift",
     "step_roll_damping_s", "step_twist_damping_s", "step_straighten_rad", "waist_yield_s", "waist_damping_s",
-    "step_timing", "step_correct_s", "foresee_falls", "lean_into_loads", "brace_tilt_rad",
+    "step_timing", "step_correct_s", "foresee_falls",
 )  # fmt: skip
 """Fields of `CommandConfig` that shape what is fed forward to legs and waist."""
+DOMAIN = ("friction", "mass_scale", "senses_loads")
+"""What is a robot's own from the start, beside its laws."""
 
 
 class Session:
@@ -60,6 +62,7 @@ class Session:
             Ranges(
                 c.velocity_x, c.velocity_y, c.yaw_rate, c.height_offset,
                 self.sides, tuple(LAWS), (REST, *clips), tuple(self._checkpoints),
+                policy.env_config.commands.lean_into_loads,
             )
         )  # fmt: skip
         self.values: dict[str, Any] = {name: control.default for name, control in self.controls.items()}
@@ -163,7 +166,7 @@ class Session:
         return self._loaded[name]
 
     def _apply_all(self) -> None:
-        for name in ("velocity_x", "motion", *(f"{r}.{part}" for r in ROBOTS for part in ("friction", "mass_scale"))):
+        for name in ("velocity_x", "motion", *(f"{r}.{part}" for r in ROBOTS for part in DOMAIN)):
             self._apply(name)
         for robot in ROBOTS:
             for side in self.sides:
@@ -196,6 +199,9 @@ class Session:
         elif rest[0] == "friction":
             mask = torch.arange(self.env.num_envs) == world
             self.env.randomizer.set_friction(mask, torch.tensor([value]))
+        elif rest[0] == "senses_loads":
+            assert self.env.load_sense is not None
+            self.env.load_sense.awake[world] = value
         else:
             self._set_mass()
 
@@ -231,6 +237,9 @@ def play_config(env: H1EnvConfig) -> H1EnvConfig:
     env.num_envs, env.num_threads, env.backend = len(ROBOTS), 1, "mjbatch"
     env.terminations.episode_s = 1e6
     env.commands.steady_rad = STEADY_RAD
+    # Who leans against loads is set robot by robot.
+    env.commands.lean_into_loads = True
+    env.commands.brace_tilt_rad = env.commands.brace_tilt_rad or BRACE_TILT_RAD
     env.upper_body.sampling.enabled = False  # what the page sets stays
     env.motions.clips.share, env.motions.clips.only, env.motions.clips.held_out = 1.0, (), ()
     for weights in (env.rewards.lower, env.rewards.upper):  # nobody learns here; a group must have one term
