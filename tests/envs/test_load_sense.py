@@ -13,6 +13,7 @@ import torch
 
 from cotap.agents.actors import as_dict
 from cotap.envs import H1Env, H1EnvConfig, h1_env, load_sense
+from cotap.envs.commands import BRACE_TILT_RAD
 from cotap.envs.load_sense import (
     COM_HEIGHT_M,
     LARGEST_TILT,
@@ -367,3 +368,17 @@ def test_robots_that_sense_loads_are_dragged_less() -> None:
         speed[senses] = float(record.velocity[..., :2].norm(dim=2)[record.alive()].mean())
     assert falls[True] < falls[False]
     assert speed[True] < 0.75 * speed[False]
+
+
+@pytest.mark.slow
+def test_walking_robots_that_brace_themselves_fall_less() -> None:
+    """The shipped base under loads of up to 30 N per axis on both hands, leaning against them."""
+    policy = load_policy(shipped_checkpoint("base"))
+    falls = {}
+    for tilt in (0.0, BRACE_TILT_RAD):
+        protocol = VelocityTracking(num_envs=256, hand_force=30.0, stand_probability=0.0, seed=5)
+        cfg = protocol.configure(policy.env_config)
+        cfg.commands.lean_into_loads, cfg.commands.brace_tilt_rad = True, tilt
+        record = record_rollout(H1Env(cfg), policy, 600, progress=False)
+        falls[tilt] = int(record.fell.any(0).sum())
+    assert falls[BRACE_TILT_RAD] < 0.8 * falls[0.0], falls
