@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import shutil
 import sys
 from pathlib import Path
+
+from cotap.graphics import choose_opengl
 
 OUT = Path("runs/demo")
 ITERATIONS = 6
@@ -24,8 +25,7 @@ MEASURES = {
 def main(argv: list[str] | None = None) -> int:
     """Distil for a few iterations from the shipped policies, then evaluate the shipped CoTaP policy. Exit status."""
     argparse.ArgumentParser(description=__doc__).parse_args(argv)
-    if sys.platform == "linux":
-        os.environ.setdefault("MUJOCO_GL", "osmesa" if not Path("/dev/dri").exists() else "egl")
+    choose_opengl()
     from cotap.evaluate import main as evaluate
     from cotap.evaluation.policy import shipped_checkpoint
     from cotap.train import main as train

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,8 @@ from typing import Any
 from paper_differences import differences
 from paper_page import Book, fallen, missing, number, ordering, picture, plot_curves, slug, verdict, write
 from paper_tables import ABLATION, IMPACT, LOAD, ROWS
+
+from cotap.graphics import choose_opengl
 
 ARMS = {
     "PD, kp 100": ["--method", "pd"],
@@ -575,8 +576,7 @@ def main() -> int:
     unknown = sorted(set(options.only) - PARTS.keys())
     if unknown:
         parser.error(f"--only {unknown[0]!r} is unknown; parts: {', '.join(PARTS)}")
-    if sys.platform == "linux":
-        os.environ.setdefault("MUJOCO_GL", "egl" if Path("/dev/dri").exists() else "osmesa")
+    choose_opengl()
     # A part alone is no page to put in the place of the whole one.
     folder = options.out or Path("runs/paper-quick" if options.quick else "runs/paper" if options.only else "docs")
     out = folder / "results"
