@@ -79,7 +79,7 @@ class CommandConfig:
     """Whether the vertical that steps, standing and policy go by is tilted by what pulls at the robot (`LoadSense`)."""
     brace_tilt_rad: float = 0.0
     """Tilt that loads ask for from which a robot that senses them stops and stands, whatever its command, until they
-    are less [rad]; 0 for never."""
+    are less [rad]; 0 for never. One that is led along a path goes on."""
     step_timing: bool = False
     """Whether the gait clock jumps to where a robot that was struck catches itself (`StepTiming`)."""
     step_correct_s: float = 0.0
