@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import sys
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any
 from cotap.agents.checkpoint import load_checkpoint, save_checkpoint, sha256, write_json
 from cotap.configs import BaseTraining, DistillTraining, from_plain, to_plain
 from cotap.evaluate import main as evaluate
-from cotap.evaluation.policy import checkpoint_path
+from cotap.evaluation.policy import checkpoint_path, find_checkpoint
 
 VELOCITY = ["velocity-tracking", "--num-envs", "1024"]
 SMALL = ["--num-envs", "64", "--threads", "1"]
@@ -31,6 +32,7 @@ EVALUATIONS = {
     "base": {
         "velocity-tracking": VELOCITY,
         "velocity-tracking.hand-forces": [*VELOCITY, "--hand-force", "40"],
+        "velocity-tracking.hand-forces-any-direction": [*VELOCITY, "--hand-force-size", "40"],
         "velocity-tracking.held-out": [
             "velocity-tracking", "--num-envs", "512",
             "--motion", "dance_b", "dance_b_mirrored", "kick", "kick_mirrored",
@@ -68,11 +70,26 @@ def earlier_runs(before: list[Path]) -> list[dict[str, Any]]:
     return runs
 
 
-def changed(training: dict[str, Any], stage: str, changes: dict[str, float]) -> dict[str, Any]:
-    """A run's config with other numbers in it.
+def shipped_description(source: Path) -> dict[str, Any]:
+    """What stands beside a policy that is shipped already; empty for any other checkpoint.
 
     Raises:
-        ValueError: a key is not that of a number in the config, or a value is out of its range.
+        ValueError: the description is another checkpoint's.
+    """
+    path = source.with_suffix(".json")
+    if not path.is_file():
+        return {}
+    description = json.loads(path.read_text())
+    if description.get("sha256") != sha256(source):
+        raise ValueError(f"{path} describes another checkpoint than {source}")
+    return description
+
+
+def changed(training: dict[str, Any], stage: str, changes: dict[str, float | bool]) -> dict[str, Any]:
+    """A run's config with other numbers and switches in it.
+
+    Raises:
+        ValueError: a key is not that of a number or switch in the config, or a value is out of its range.
     """
     config = from_plain(DistillTraining if stage == "distill" else BaseTraining, training)
     for key, value in changes.items():
@@ -80,8 +97,8 @@ def changed(training: dict[str, Any], stage: str, changes: dict[str, float]) -> 
         owner: Any = config
         for part in path:
             owner = getattr(owner, part, None)
-        if not isinstance(getattr(owner, field, None), float):
-            raise ValueError(f"{key!r} is no number of the config")
+        if type(getattr(owner, field, None)) is not type(value):
+            raise ValueError(f"{key!r} is no {'switch' if isinstance(value, bool) else 'number'} of the config")
         setattr(owner, field, value)
     config.check()
     return to_plain(config)
@@ -112,9 +129,15 @@ def scaled(content: dict[str, Any], factors: dict[str, float]) -> dict[str, Any]
     return content | {"model": model}
 
 
-def ship(source: Path, name: str, before: list[Path], changes: dict[str, float], factors: dict[str, float]) -> int:
-    """Strip, save, describe, evaluate. Returns the exit status."""
-    earlier = earlier_runs(before)
+def ship(
+    source: Path, name: str, before: list[Path], changes: dict[str, float | bool], factors: dict[str, float]
+) -> int:
+    """Strip, save, describe, evaluate. Returns the exit status.
+
+    A policy that is shipped already keeps its provenance: what is changed now comes on top of what was before.
+    """
+    known = shipped_description(source)
+    earlier = known.get("earlier_runs", []) + earlier_runs(before)
     content = scaled(load_checkpoint(source), factors)
     target = checkpoint_path(name)
     target.parent.mkdir(exist_ok=True)
@@ -131,8 +154,8 @@ def ship(source: Path, name: str, before: list[Path], changes: dict[str, float],
             "command": config["command"],
             "averaged": config.get("averaged", []),
             "earlier_runs": earlier,
-            "changed_after_training": changes,
-            "outputs_scaled_after_training": factors,
+            "changed_after_training": known.get("changed_after_training", {}) | changes,
+            "outputs_scaled_after_training": combined(known.get("outputs_scaled_after_training", {}), factors),
             "seed": config["training"]["seed"],
             "iterations": content["iteration"],
             "samples": content["samples"],
@@ -148,15 +171,38 @@ def ship(source: Path, name: str, before: list[Path], changes: dict[str, float],
     return 0
 
 
+def combined(before: dict[str, float], now: dict[str, float]) -> dict[str, float]:
+    """Factors applied one after the other.
+
+    Raises:
+        ValueError: a joint is named now that was scaled before under a name of which this is a part, or the other way
+            round, so that the product is no single factor.
+    """
+    for key, other in itertools.product(now, before):
+        if key != other and (key in other or other in key):
+            raise ValueError(f"{key!r} meets {other!r}, by which outputs were scaled before: name the joints as then")
+    return {key: before.get(key, 1.0) * now.get(key, 1.0) for key in before | now}
+
+
 def numbers(pairs: list[str]) -> dict[str, float]:
     """Of KEY=VALUE; ValueError where a value is no number."""
     return {key: float(value) for key, _, value in (text.partition("=") for text in pairs)}
 
 
+def settings(pairs: list[str]) -> dict[str, float | bool]:
+    """Of KEY=VALUE with a number, yes or no; ValueError where a value is none of these."""
+    switches = {text: text.endswith("=yes") for text in pairs if text.endswith(("=yes", "=no"))}
+    return numbers([text for text in pairs if text not in switches]) | {
+        text.partition("=")[0]: on for text, on in switches.items()
+    }
+
+
 def main() -> int:
     """Parse and ship."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("checkpoint", type=Path)
+    parser.add_argument(
+        "checkpoint", type=find_checkpoint, help="a file, or the name of a policy that is shipped already"
+    )
     parser.add_argument("--name", default="base", choices=EVALUATIONS)
     parser.add_argument(
         "--before", type=Path, nargs="*", default=[], metavar="RUN",
@@ -164,7 +210,8 @@ def main() -> int:
     )  # fmt: skip
     parser.add_argument(
         "--change", nargs="*", default=[], metavar="KEY=VALUE",
-        help="numbers of the config that the policy is shipped with instead of those it was trained with",
+        help="numbers and switches (yes, no) of the config that the policy is shipped with instead of those it was "
+        "trained with",
     )  # fmt: skip
     parser.add_argument(
         "--scale", nargs="*", default=[], metavar="JOINT=FACTOR",
@@ -172,7 +219,7 @@ def main() -> int:
     )  # fmt: skip
     options = parser.parse_args()
     try:
-        changes, factors = numbers(options.change), numbers(options.scale)
+        changes, factors = settings(options.change), numbers(options.scale)
         return ship(options.checkpoint, options.name, options.before, changes, factors)
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)

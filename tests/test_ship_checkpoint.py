@@ -16,6 +16,7 @@ from cotap.agents.checkpoint import load_checkpoint, save_checkpoint
 from cotap.configs import BASE_RECIPES, BaseTraining, DistillTraining, from_plain, to_plain
 from cotap.evaluation.policy import load_policy, shipped_checkpoint
 
+LEANS, BRACES = "env.commands.lean_into_loads", "env.commands.brace_tilt_rad"
 HOLD_BACK, CATCH_LIFT = "env.commands.step_hold_back_m", "env.commands.step_catch_lift"
 
 
@@ -49,6 +50,8 @@ def test_only_what_is_named_is_changed(stage, kind):
         ("env.commands=1", "'env.commands' is no number"),
         ("nowhere.at.all=1", "'nowhere.at.all' is no number"),
         ("env.num_envs=2", "'env.num_envs' is no number"),
+        (f"{HOLD_BACK}=yes", f"'{HOLD_BACK}' is no switch"),
+        (f"{LEANS}=1", f"'{LEANS}' is no number"),
         (f"{HOLD_BACK}=-1", "commands.step_hold_back_m"),
         (f"{HOLD_BACK}=far", "far"),
         (HOLD_BACK, "could not convert"),
@@ -99,3 +102,44 @@ def test_a_scaled_policy_moves_its_joint_by_that_much_and_the_others_as_before(t
     pitch = torch.tensor(["hip_pitch" in joint for joint in content["layout"]["joints"]])
     torch.testing.assert_close(after, before * torch.where(pitch, 0.9, 1.0))
     assert pitch.sum() == 2
+
+
+def test_switches_are_changed_too():
+    changes = sc.settings([f"{LEANS}=yes", f"{BRACES}=0.05"])
+    commands = sc.changed(to_plain(BaseTraining()), "base", changes)["env"]["commands"]
+    assert (commands["lean_into_loads"], commands["brace_tilt_rad"]) == (True, 0.05)
+    back = sc.settings([f"{LEANS}=no", f"{BRACES}=0"])
+    commands = sc.changed(to_plain(BaseTraining()), "base", back)["env"]["commands"]
+    assert (commands["lean_into_loads"], commands["brace_tilt_rad"]) == (False, 0.0)
+
+
+def test_a_policy_that_is_shipped_already_keeps_its_provenance(tmp_path, monkeypatch):
+    source = shipped_checkpoint("cotap")
+    known = json.loads(source.with_suffix(".json").read_text())
+    target = tmp_path / "out" / "cotap.pt"
+    monkeypatch.setattr(sc, "checkpoint_path", lambda _: target)
+    monkeypatch.setattr(sc, "EVALUATIONS", {"cotap": {}})
+    options = ["--name", "cotap", "--change", f"{HOLD_BACK}=0.4", "--scale", "knee=0.9"]
+    monkeypatch.setattr(sys, "argv", ["ship_checkpoint.py", "cotap", *options])
+    assert sc.main() == 0
+    new = json.loads(target.with_suffix(".json").read_text())
+    kept = ("stage", "commit", "command", "averaged", "earlier_runs", "seed", "iterations", "samples", "machine")
+    assert {key: new[key] for key in kept} == {key: known[key] for key in kept}
+    assert new["changed_after_training"] == known["changed_after_training"] | {HOLD_BACK: 0.4}
+    before = known["outputs_scaled_after_training"]
+    assert new["outputs_scaled_after_training"] == pytest.approx(before | {"knee": 0.9 * before["knee"]})
+    assert load_policy(target).env_config.commands.step_hold_back_m == 0.4
+
+
+def test_a_description_of_another_checkpoint_is_refused(tmp_path):
+    (tmp_path / "c.pt").write_bytes(b"one")
+    assert sc.shipped_description(tmp_path / "c.pt") == {}
+    (tmp_path / "c.json").write_text(json.dumps({"sha256": "another's"}))
+    with pytest.raises(ValueError, match="describes another checkpoint"):
+        sc.shipped_description(tmp_path / "c.pt")
+
+
+def test_factors_of_names_that_overlap_are_refused():
+    assert sc.combined({"knee": 0.9}, {"hip": 0.5, "knee": 0.5}) == {"knee": 0.45, "hip": 0.5}
+    with pytest.raises(ValueError, match="'hip' meets 'hip_pitch'"):
+        sc.combined({"hip_pitch": 0.9}, {"hip": 0.5})

@@ -32,6 +32,23 @@ def test_draws_follow_ranges_and_shares(rng):
     assert abs(float(torch.corrcoef(force[:, :, 0].T)[0, 1])) < 0.05  # hands differ
 
 
+def test_forces_of_any_direction_are_even_in_size_and_direction_and_within_their_size(rng):
+    n = 20_000
+    hands = forces(n, size=40.0, force_x=(100.0, 100.0), zero_probability=1.0)  # by axis: nothing of it counts
+    hands.reset(everyone(n), rng)
+    force = hands.current(torch.zeros(n, 2, 3, 4), STRONG)
+    sizes = force.norm(dim=-1)
+    assert 39.9 < float(sizes.max()) <= 40.0 + 1e-4
+    for share in (0.25, 0.5, 0.75):
+        assert float(sizes.quantile(share)) == pytest.approx(40.0 * share, abs=0.6)
+    # The height of a point drawn evenly on a sphere is even in [-1, 1], whatever the axis (Archimedes).
+    along = force / sizes.unsqueeze(-1)
+    for axis in range(3):
+        assert float((along[:, :, axis] < 0.5).float().mean()) == pytest.approx(0.75, abs=0.01)
+        assert float((along[:, :, axis] < -0.5).float().mean()) == pytest.approx(0.25, abs=0.01)
+    assert abs(float(torch.corrcoef(force[:, :, 0].T)[0, 1])) < 0.05  # hands differ
+
+
 def test_forces_hold_for_their_time(rng):
     hands = forces(1, hold_s=(0.1, 0.1), zero_probability=0.0)
     hands.reset(everyone(1), rng)

@@ -13,6 +13,7 @@ from cotap.envs import H1EnvConfig
 from cotap.evaluate import VelocityTrackingOptions, _leaning, main
 from cotap.evaluation import policy
 from cotap.evaluation.policy import load_policy, shipped_checkpoint, shipped_names
+from cotap.evaluation.protocols import VelocityTracking
 from cotap.evaluation.render import RenderingUnavailable, open_renderer
 from cotap.robots import h1
 from cotap.robots.mjcf import build_model
@@ -93,6 +94,13 @@ def test_robots_lean_into_loads_only_when_told_to(tmp_path: Path):
     assert results["yes"]["metrics"] != results["no"]["metrics"]
 
 
+@pytest.mark.parametrize(("force", "size", "loaded"), [(0.0, 0.0, False), (20.0, 0.0, True), (0.0, 30.0, True)])
+def test_hands_are_loaded_as_asked_by_axis_or_in_any_direction(force, size, loaded):
+    hands = VelocityTracking(hand_force=force, hand_force_size=size).configure(H1EnvConfig()).hand_forces
+    assert (hands.enabled, hands.size, hands.force_z) == (loaded, size, (-force, force))
+    assert (hands.curriculum_start, hands.episode_share, hands.zero_probability) == (1.0, 1.0, 0.0)
+
+
 @pytest.mark.parametrize(
     ("options", "leans", "tilt"),
     [((), True, 0.04), (("--lean-into-loads", "no"), False, 0.0), (("--brace-tilt-rad", "0"), True, 0.0),
@@ -125,6 +133,8 @@ def test_loaded_policy_is_deterministic_and_reads_430_numbers():
         ([*SMALL, "--json", "no/such/folder/x.json"], "no/such/folder"),
         ([*SMALL, "--torque-limit-scale", "-1"], "torque_limit_scale"),
         ([*SMALL, "--collision", "arms"], "collision 'arms'"),
+        ([*SMALL, "--hand-force", "20", "--hand-force-size", "30"], "hand_force is 20 and hand_force_size 30"),
+        ([*SMALL, "--hand-force-size", "-1"], "hand_force_size"),
         ([*SMALL, "--lean-into-loads", "maybe"], "known: as-trained, no, yes"),
         ([*SMALL, "--lean-into-loads", "no", "--brace-tilt-rad", "0.04"], "brace_tilt_rad is 0.04"),
     ],

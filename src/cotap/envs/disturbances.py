@@ -25,6 +25,8 @@ class HandForceConfig:
     """[N]."""
     force_z: tuple[float, float] = (-50.0, 5.0)
     """[N]."""
+    size: float = 0.0
+    """Above zero: forces in any direction, of a size up to this, evenly drawn, instead of axis by axis [N]."""
     zero_probability: float = 0.25
     """Chance of each axis of each hand to be free."""
     hold_s: tuple[float, float] = (3.0, 5.0)
@@ -43,6 +45,7 @@ class HandForceConfig:
         for name in ("force_x", "force_y", "force_z", "hold_s"):
             require_interval(f"hand_forces.{name}", getattr(self, name))
         require_range("hand_forces.hold_s[0]", self.hold_s[0], 0.02, 1e6)
+        require_range("hand_forces.size", self.size, 0.0, 1000.0)
         for name in (
             "episode_share",
             "zero_probability",
@@ -79,16 +82,21 @@ class HandForces(Stateful):
             self._draw(mask, rng)
 
     def _draw(self, mask: torch.Tensor, rng: torch.Generator) -> None:
-        n, hands = int(mask.sum()), self._force_h.shape[1]
+        n = int(mask.sum())
         if n == 0:
             return
-        cfg = self.cfg
-        bounds = (cfg.force_x, cfg.force_y, cfg.force_z)
-        force = torch.stack([uniform(rng, *b, n, hands) for b in bounds], -1)
-        self._force_h[mask] = force * (
-            torch.rand(n, hands, 3, generator=rng, device=rng.device) >= cfg.zero_probability
-        )
-        self._remaining_s[mask] = uniform(rng, *cfg.hold_s, n)
+        self._force_h[mask] = self._any_direction(n, rng) if self.cfg.size > 0.0 else self._by_axis(n, rng)
+        self._remaining_s[mask] = uniform(rng, *self.cfg.hold_s, n)
+
+    def _by_axis(self, n: int, rng: torch.Generator) -> torch.Tensor:
+        cfg, hands = self.cfg, self._force_h.shape[1]
+        force = torch.stack([uniform(rng, *b, n, hands) for b in (cfg.force_x, cfg.force_y, cfg.force_z)], -1)
+        return force * (torch.rand(n, hands, 3, generator=rng, device=rng.device) >= cfg.zero_probability)
+
+    def _any_direction(self, n: int, rng: torch.Generator) -> torch.Tensor:
+        hands = self._force_h.shape[1]
+        direction = torch.nn.functional.normalize(torch.randn(n, hands, 3, generator=rng, device=rng.device), dim=-1)
+        return direction * uniform(rng, 0.0, self.cfg.size, n, hands).unsqueeze(-1)
 
     def step(self, rng: torch.Generator) -> None:
         """Advance by one control step; forces that have been held long enough change."""

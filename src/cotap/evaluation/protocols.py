@@ -37,6 +37,8 @@ class VelocityTracking:
     """Share of commands that ask the robot to stand."""
     hand_force: float = 0.0
     """Random forces of up to this size, per axis, on both hands [N]."""
+    hand_force_size: float = 0.0
+    """Random forces in any direction, of a size up to this, on both hands, instead [N]."""
     randomize: bool = True
     """Domain randomisation."""
     arm_motion: bool = True
@@ -65,6 +67,12 @@ class VelocityTracking:
         require_range("stand_probability", self.stand_probability, 0.0, 1.0)
         require_range("steady_rad", self.steady_rad, 0.0, 10.0)
         require_range("hand_force", self.hand_force, 0.0, 1000.0)
+        require_range("hand_force_size", self.hand_force_size, 0.0, 1000.0)
+        if self.hand_force > 0.0 and self.hand_force_size > 0.0:
+            raise ValueError(
+                f"hand_force is {self.hand_force:g} and hand_force_size {self.hand_force_size:g}: forces are drawn "
+                "either axis by axis or in any direction, so one of them must be 0"
+            )
         require_range("torque_limit_scale", self.torque_limit_scale, 1e-3, 1e3)
         if self.collision:
             require_one_of("collision", self.collision, COLLISIONS)
@@ -89,7 +97,7 @@ class VelocityTracking:
         c.resample_s = (self.command_seconds, self.command_seconds)
         c.stand_probability, c.axis_zero_probability = self.stand_probability, 0.0
         f = env.hand_forces
-        f.enabled = self.hand_force > 0.0
+        f.enabled, f.size = self.hand_force > 0.0 or self.hand_force_size > 0.0, self.hand_force_size
         f.force_x = f.force_y = f.force_z = (-self.hand_force, self.hand_force)
         f.zero_probability, f.curriculum_start, f.episode_share = 0.0, 1.0, 1.0
         f.curriculum_step = f.curriculum_back = 0.0
