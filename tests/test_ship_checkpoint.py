@@ -134,6 +134,8 @@ def test_a_policy_that_is_shipped_already_keeps_its_provenance(tmp_path, monkeyp
 def test_a_description_of_another_checkpoint_is_refused(tmp_path):
     (tmp_path / "c.pt").write_bytes(b"one")
     assert sc.shipped_description(tmp_path / "c.pt") == {}
+    (tmp_path / "c.json").write_text(json.dumps({"averaged": []}))  # an average's
+    assert sc.shipped_description(tmp_path / "c.pt") == {}
     (tmp_path / "c.json").write_text(json.dumps({"sha256": "another's"}))
     with pytest.raises(ValueError, match="describes another checkpoint"):
         sc.shipped_description(tmp_path / "c.pt")
