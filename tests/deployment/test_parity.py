@@ -34,7 +34,8 @@ def batched(
     policy = load_policy(shipped_checkpoint("base"))
     cfg = policy.env_config
     cfg.num_envs, cfg.num_threads, cfg.fixed_base, cfg.upper_body = 1, 1, True, laws
-    cfg.commands.lean_into_loads = leans
+    if not leans:
+        cfg.commands.lean_into_loads, cfg.commands.brace_tilt_rad = False, 0.0
     cfg.collision = "feet"  # as the engine below: rounding grows where legs touch
     cfg.assist.enabled = cfg.hand_forces.enabled = cfg.blows.enabled = cfg.randomization.enabled = False
     cfg.motions.clips.only, cfg.motions.clips.share = ("punch",), 1.0

@@ -39,7 +39,7 @@ def test_of_a_policy_that_foresees_falls_otherwise_people_are_told(session, monk
 def test_one_robot_leans_against_what_pulls_at_both_and_stops_for_it(session):
     """Both walk and both hands are pulled back: the tilt of 24 N at 1.1 m is 0.06 rad, enough to brace for."""
     pull = {f"held.{side}.x": -12.0 for side in ("left", "right")}
-    session.set({"stand": False, "velocity_x": 0.4, "b.senses_loads": True} | pull)
+    session.set({"stand": False, "velocity_x": 0.4, "a.senses_loads": False, "b.senses_loads": True} | pull)
     samples = run(session, 150)
     sense, command = session.env.load_sense, session.env.commands.current()
     assert sense.tilt[0].norm() == 0.0
