@@ -360,7 +360,7 @@ def test_robots_that_sense_loads_are_dragged_less() -> None:
         cfg = VelocityTracking(num_envs=256, hand_force=20.0, stand_probability=1.0, seed=5).configure(
             policy.env_config
         )
-        cfg.commands.lean_into_loads = senses
+        cfg.commands.lean_into_loads, cfg.commands.brace_tilt_rad = senses, BRACE_TILT_RAD * senses
         record = record_rollout(H1Env(cfg), policy, 600, progress=False)
         falls[senses] = int(record.fell.any(0).sum())
         speed[senses] = float(record.velocity[..., :2].norm(dim=2)[record.alive()].mean())
