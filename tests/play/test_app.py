@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import re
 import socket
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from viser import ViserServer
 
 from cotap.evaluation.policy import shipped_checkpoint
@@ -228,6 +230,17 @@ def test_no_browser_is_asked_for_an_environment_map_and_for_shadows_only_when_th
     assert not last("EnableLightsMessage").cast_shadow
     app.scene.cast_shadows(True)
     assert last("EnableLightsMessage").cast_shadow
+
+
+@pytest.mark.parametrize(
+    ("side_by_side", "braces", "told"),
+    [(False, [True, True], ["A"]), (True, [False, True], ["B"]), (True, [False, False], [])],
+)
+def test_the_head_says_who_stands_because_it_braces_itself(app, side_by_side, braces, told):
+    app.session.set({"side_by_side": side_by_side})
+    app.session.env.load_sense.braces = torch.tensor(braces)
+    app._show_status()
+    assert re.findall(r"robot (\w) braces itself", app.panel.status.content) == told
 
 
 def test_a_simulation_that_fails_ends_the_program_and_says_why(app, monkeypatch):

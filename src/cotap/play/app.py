@@ -169,6 +169,9 @@ class App:
             f"{rate:.0f} control steps/s ({rate * s.dt:.2f} of real time)",
             f"falls: {', '.join(str(n) for n in s.falls[: self._shown()])}",
         ]  # fmt: skip
+        # Else nobody would know why a robot that is told to walk stands.
+        shown = list(zip(ROBOTS, s.braces, strict=True))[: self._shown()]
+        parts += [f"robot {name.upper()} braces itself" for name, braces in shown if braces]
         if self._recorder is not None:
             parts.append(f"**recording {self._recorder.seconds:.1f} s**")
         self.panel.status.content = " · ".join(parts)

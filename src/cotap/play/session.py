@@ -78,6 +78,11 @@ class Session:
         """Control step [s]."""
         return self.env.dt
 
+    @property
+    def braces(self) -> list[bool]:
+        """Robots that stand, whatever they are told, since they brace themselves against loads."""
+        return self.env.load_sense.braces.tolist() if self.env.load_sense else [False] * len(ROBOTS)
+
     @torch.inference_mode()
     def set(self, values: Mapping[str, Any]) -> list[str]:
         """Bring values, cleaned by their controls, into force. Returns what to tell people.
