@@ -18,6 +18,7 @@ from dummy_env import DummyEnv, make_runner
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from cotap.agents.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
+from cotap.agents.losses import LOWEST_RATE
 from cotap.agents.runner import DualRunner, TrainingFault, check_run_dir
 from cotap.agents.runner_config import RunnerConfig
 from cotap.envs import H1Env, H1EnvConfig
@@ -225,6 +226,7 @@ def test_a_checkpoint_of_weights_alone_starts_a_new_run(tmp_path: Path, capsys: 
     assert "no optimisers and simulator states" in "".join(capsys.readouterr())
     assert runner.current_learning_iteration == 0
     assert_same(dict(weights(runner)), dict(content["model"]))
+    assert set(runner.alg.learning_rates.values()) == {LOWEST_RATE}  # Adam's first steps are as large as its rate
 
 
 def test_random_numbers_of_a_graphics_card_go_on_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

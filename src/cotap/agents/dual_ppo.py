@@ -12,6 +12,7 @@ from torch import nn
 from cotap.agents.actors import AgentLayout, DualActorCritic, Observations
 from cotap.agents.distillation import Guide
 from cotap.agents.losses import (
+    LOWEST_RATE,
     adapt_learning_rate,
     clipped_surrogate,
     clipped_value_loss,
@@ -301,6 +302,11 @@ class DualPPO:
             group["lr"] = self.learning_rates[name]
         optimizer.step()
         return stats
+
+    def begin_slowly(self) -> None:
+        """Start from the lowest rate: the networks are trained, the optimisers are not, and Adam's first steps are as
+        large as its rate, whatever the gradient. Rates grow by themselves where a policy hardly moves."""
+        self.learning_rates = dict.fromkeys(self.names, LOWEST_RATE)
 
     def state_dict(self) -> dict[str, Any]:
         """Optimisers, learning rates and number of updates; the networks are saved apart."""

@@ -66,8 +66,12 @@ def generalized_advantages(
     return advantages
 
 
+LOWEST_RATE = 1e-5
+"""Adam's steps at this rate hardly move a policy, whatever the gradient."""
+
+
 def adapt_learning_rate(
-    rate: float, kl: float, desired_kl: float, low: float = 1e-5, high: float = 3e-3, factor: float = 1.5
+    rate: float, kl: float, desired_kl: float, low: float = LOWEST_RATE, high: float = 3e-3, factor: float = 1.5
 ) -> float:
     """Next learning rate: down when the policy moved more than twice `desired_kl`, up when less than half."""
     if kl > 2.0 * desired_kl:
