@@ -14,6 +14,7 @@ import torch
 from cotap.agents.actors import as_dict
 from cotap.envs import H1Env, H1EnvConfig, h1_env, load_sense
 from cotap.envs.commands import BRACE_TILT_RAD
+from cotap.envs.forces import ForceProfile
 from cotap.envs.load_sense import (
     COM_HEIGHT_M,
     LARGEST_TILT,
@@ -252,6 +253,23 @@ def test_all_that_keeps_balance_goes_by_the_tilted_vertical(monkeypatch):
     for gravity in seen.values():
         torch.testing.assert_close(gravity, env.felt.projected_gravity_t)
         assert (gravity != env.state.projected_gravity_t).any(1).all()
+
+
+def test_rewards_go_by_the_vertical_that_the_true_loads_ask_for():
+    """Both hands are pushed forward by 12 N at a metre or so; what the robot makes of it does not matter."""
+    tilts = {}
+    for leans in (True, False):
+        cfg = H1EnvConfig(num_envs=2, num_threads=1)
+        cfg.commands.lean_into_loads, cfg.hand_forces.enabled = leans, False
+        cfg.force = ForceProfile(force=(12.0, 0.0, 0.0), start_s=0.0, hand="both")
+        env = H1Env(cfg)
+        env.reset()
+        env.step(torch.zeros(2, env.num_actions))
+        tilts[leans] = env.record.load_tilt
+    height = env.state.hand_pos_w[:, :, 2].mean(1)
+    torch.testing.assert_close(tilts[True][:, 0], 24.0 * height / (env.weight_n * COM_HEIGHT_M), rtol=0.02, atol=0.0)
+    assert (tilts[True][:, 1].abs() < 0.003).all()
+    assert not tilts[False].any()
 
 
 def test_an_environment_that_restarts_senses_anew(env):

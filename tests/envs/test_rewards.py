@@ -65,6 +65,7 @@ def perfect() -> StepRecord:
         key_velocities_t=torch.zeros(1, 2, 3),
         key_velocities_reference_t=torch.zeros(1, 2, 3),
         mean_error=torch.zeros(1, 3),
+        load_tilt=torch.zeros(1, 2),
         fell=torch.tensor([False]),
         joint_low=torch.full((5,), -0.5),
         joint_high=torch.full((5,), 0.5),
@@ -125,7 +126,11 @@ CASES = [
     ("balance", {**STANDING, "torso_pos_w": [[2.9, -2.0, HEIGHT]]}, math.exp(-(0.05**2 + 0.06**2) / 0.01)),
     ("balance", {**STANDING, "heading_w": matrix_about_z(math.pi / 2)}, math.exp(-(0.06**2 + 0.15**2) / 0.01)),
     ("balance", {"torso_pos_w": [[2.9, -2.0, HEIGHT]]}, 0.0),
+    # Pushed back and to the left, it belongs 0.09 m further forward and 0.045 m further to the right.
+    ("balance", {**STANDING, "load_tilt": [[-0.1, 0.05]]}, math.exp(-(0.06**2 + 0.015**2) / 0.01)),
     ("upright", {"projected_gravity_t": [[0.3, -0.4, -math.sqrt(0.75)]]}, 0.25),
+    # Leaning forward and to the left against what pushes it back and, harder, to the right.
+    ("upright", {"projected_gravity_t": [[0.1, 0.1, -math.sqrt(0.98)]], "load_tilt": [[-0.1, -0.15]]}, 0.05**2),
     ("vertical_velocity", {"torso_linear_velocity_h": [[0.5, -0.2, -0.3]]}, 0.09),
     ("roll_pitch_rate", {"torso_angular_velocity_t": [[0.3, -0.4, 7.0]]}, 0.25),
     ("contact_schedule", {"foot_force": [[250.0, 4.9]]}, 0.5),

@@ -32,7 +32,7 @@ from cotap.envs.forces import ForceProfile, ScriptedForces
 from cotap.envs.foresight import Foresight
 from cotap.envs.gait import desired_contact, swing_progress
 from cotap.envs.impedance import ImpedanceConfig, PathFollower
-from cotap.envs.load_sense import LoadSense
+from cotap.envs.load_sense import LoadSense, load_tilt
 from cotap.envs.observations import (
     GOALS_PER_ARM,
     ObservationConfig,
@@ -577,6 +577,7 @@ class H1Env(VecEnv):
         return StepRecord(
             state=s,
             command=command,
+            load_tilt=self._load_tilt(),
             reference=reference,
             action=action,
             last_action=self._last_action,
@@ -597,6 +598,12 @@ class H1Env(VecEnv):
             default_position=self._default,
             sideways=self._sideways,
         )
+
+    def _load_tilt(self) -> torch.Tensor:
+        """By how much the loads on its hands tilt the vertical of a robot that leans against them, (N, 2) [rad]."""
+        if not self.load_sense:
+            return self.state.torso_pos_w.new_zeros(self.num_envs, 2)
+        return load_tilt(self.state, self.state.hand_pos_w, self._hand_force_w, self.weight_n)
 
     def _average_error(self) -> torch.Tensor:
         """Velocity errors (N, 3), averaged exponentially over half a stride."""

@@ -12,6 +12,7 @@ import torch
 
 from cotap.checks import require_finite
 from cotap.envs.commands import Command
+from cotap.envs.load_sense import COM_HEIGHT_M
 from cotap.envs.motions import ArmReference
 from cotap.envs.state import RobotState
 from cotap.rotations import rotate
@@ -48,6 +49,8 @@ class StepRecord:
     """(N, P, 3) [m/s]."""
     mean_error: torch.Tensor
     """(N, 3) horizontal velocity [m/s] and yaw rate [rad/s] minus their commands, averaged over about half a stride."""
+    load_tilt: torch.Tensor
+    """(N, 2) by how much loads tilt the vertical that a robot should go by, x and y of the torso frame [rad]."""
     fell: torch.Tensor
     """(N,) bool: the episode ends in a fall."""
     joint_low: torch.Tensor
@@ -162,15 +165,17 @@ def balance(s: StepRecord) -> torch.Tensor:
     """While standing, closeness of where the torso is heading to to the middle of the feet.
 
     Where it is heading to is its capture point, position plus velocity times the time constant of falling (0.3 s).
+    Under loads that point belongs where the robot leans against them.
     """
-    heading_to = s.state.torso_pos_w[:, :2] + 0.3 * rotate(s.state.heading_w, s.state.torso_linear_velocity_h)[:, :2]
+    ahead_h = 0.3 * s.state.torso_linear_velocity_h + COM_HEIGHT_M * torch.nn.functional.pad(s.load_tilt, (0, 1))
+    heading_to = s.state.torso_pos_w[:, :2] + rotate(s.state.heading_w, ahead_h)[:, :2]
     middle = s.state.foot_pos_w[:, :, :2].mean(1)
     return s.command.stand * torch.exp(-(heading_to - middle).square().sum(1) / 0.01)
 
 
 def upright(s: StepRecord) -> torch.Tensor:
-    """Squared sine of the torso's tilt."""
-    return s.state.projected_gravity_t[:, :2].square().sum(1)
+    """Squared sine of the torso's tilt, from the vertical that loads ask for."""
+    return (s.state.projected_gravity_t[:, :2] + s.load_tilt).square().sum(1)
 
 
 def vertical_velocity(s: StepRecord) -> torch.Tensor:
