@@ -665,11 +665,12 @@ def test_bad_options_of_both_stages_are_named(options: list[Any], needle: str, c
     assert needle in capsys.readouterr().err
 
 
-def test_a_shipped_policy_goes_on_from_what_it_is(tmp_path: Path):
+@pytest.mark.parametrize("command", [["base", RESUME], ["distill", BASE_CHECKPOINT]], ids=["base", "distill"])
+def test_a_shipped_policy_goes_on_from_what_it_is(command: list[str], tmp_path: Path):
     """Its optimisers are new, and Adam's first steps are as large as its rate: at a rate for learning from nothing they
     take the policy 1.5 nats away from itself in the first iteration, and it takes hundreds of them to come back."""
     folder = tmp_path / "run"
-    assert run("base", RESUME, "base", ITERATIONS, 1, ENVS, 64, THREADS, 1, RUN_DIR, folder) == 0
+    assert run(*command, "base", ITERATIONS, 1, ENVS, 64, THREADS, 1, RUN_DIR, folder) == 0
     scalars = EventAccumulator(str(folder)).Reload()
     for agent in ("lower", "upper"):
         assert 0.0 < scalars.Scalars(f"agents/{agent}/kl")[0].value < 0.03

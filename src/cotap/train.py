@@ -317,6 +317,7 @@ def _train(stage: str, options: BaseOptions | DistillOptions, base: dict[str, An
         runner = DualRunner(env, training.runner, training.ppo, run_dir, config, training.device, guide, ranks)
         if guide and not options.resume:
             guide.start(runner.alg.model)
+            runner.alg.begin_anew()
         if ranks.size > 1:
             torch.manual_seed(training.env.seed)
         if options.resume:

@@ -13,6 +13,7 @@ from torch.distributions import Independent, Normal, kl_divergence
 
 from cotap.agents.actors import AgentLayout, Observations, as_dict
 from cotap.agents.dual_ppo import DualPPO, DualPPOConfig
+from cotap.agents.losses import LOWEST_RATE
 from cotap.agents.precision import resolve_precision
 from cotap.agents.runner import layout_of
 
@@ -392,6 +393,8 @@ BAD = [
     ("desired_kl", 0.0, "ppo.desired_kl must lie in .*, got 0.0"),
     ("max_grad_norm", NAN, "ppo.max_grad_norm must be a finite number, got nan"),
     ("initial_std", 0.0, "ppo.initial_std must lie in .*, got 0.0"),
+    ("restart_std", (0.3, 11.0), r"ppo.restart_std\[1\] must lie in .*10.0\], got 11.0"),  # it would be cut at once
+    ("restart_std", (NAN, 0.1), r"ppo.restart_std\[0\] must be a finite number, got nan"),
     ("precision", "fp16", "precision 'fp16' is unknown.*known: auto, bf16, fp32"),
     ("mini_batches", 49, "ppo.mini_batches must be at most num_envs \\* steps = 48, got 49"),
 ]
@@ -429,3 +432,23 @@ def test_spread_is_limited_more_and_more():
     again = make_learner(initial_std=0.8, std_half_life=2.0, least_std=0.3)
     again.load_state_dict(learner.state_dict())
     assert again.iterations == 5
+
+
+def test_trained_networks_go_on_slowly_and_as_wide_as_they_are_told():
+    learner = make_learner(initial_std=0.5)
+    with torch.no_grad():
+        learner.model.log_std["lower"].fill_(math.log(0.1))
+    learner.begin_anew()
+    assert learner.learning_rates == {"lower": LOWEST_RATE, "upper": LOWEST_RATE}
+    torch.testing.assert_close(
+        learner.model.log_std["lower"].exp(), torch.full_like(learner.model.log_std["lower"], 0.1)
+    )
+    learner = make_learner(initial_std=0.5, restart_std=(0.25, 0.05))
+    learner.begin_anew()
+    stds = {name: log_std.exp().detach().unique().tolist() for name, log_std in learner.model.log_std.items()}
+    assert stds == {"lower": [pytest.approx(0.25)], "upper": [pytest.approx(0.05)]}
+
+
+def test_a_spread_for_another_number_of_agents_is_refused():
+    with pytest.raises(ValueError, match=r"ppo.restart_std must be one for each of lower, upper, got 1: \(0.25,\)"):
+        make_learner(restart_std=(0.25,)).begin_anew()

@@ -38,6 +38,10 @@ class DualPPOConfig:
     """Iterations in which the largest standard deviation allowed falls by half: wide at first, precise later."""
     least_std: float = 0.2
     """Where that fall ends."""
+    restart_std: tuple[float, ...] = ()
+    """Standard deviations, agent by agent, with which trained networks go on whose optimisers are new; none for as they
+    were. A policy that has become precise learns slowly: its rate follows the KL divergence, which grows with the
+    inverse square of the deviation. At most `least_std`, or `initial_std` if that is larger."""
     steps: int = 24
     """Steps per world and iteration."""
     epochs: int = 3
@@ -91,6 +95,8 @@ class DualPPOConfig:
             require_range(f"ppo.{name}", getattr(self, name), 1e-8, 1e6)
         for name in ("entropy", "value"):
             require_range(f"ppo.{name}", getattr(self, name), 0.0, 1e3)
+        for i, std in enumerate(self.restart_std):
+            require_range(f"ppo.restart_std[{i}]", std, 1e-8, max(self.initial_std, self.least_std))
 
 
 @dataclass
@@ -303,10 +309,19 @@ class DualPPO:
         optimizer.step()
         return stats
 
-    def begin_slowly(self) -> None:
-        """Start from the lowest rate: the networks are trained, the optimisers are not, and Adam's first steps are as
-        large as its rate, whatever the gradient. Rates grow by themselves where a policy hardly moves."""
+    def begin_anew(self) -> None:
+        """Start with networks that are trained and optimisers that are not: from the lowest rate, since Adam's first
+        steps are as large as its rate, whatever the gradient (rates grow by themselves where a policy hardly moves),
+        and with `restart_std`. Raises ValueError if that is not for as many agents as there are."""
         self.learning_rates = dict.fromkeys(self.names, LOWEST_RATE)
+        stds = self.cfg.restart_std
+        if stds and len(stds) != len(self.names):
+            raise ValueError(
+                f"ppo.restart_std must be one for each of {', '.join(self.names)}, got {len(stds)}: {stds}"
+            )
+        with torch.no_grad():
+            for name, std in zip(self.names, stds, strict=False):
+                self.model.log_std[name].fill_(math.log(std))
 
     def state_dict(self) -> dict[str, Any]:
         """Optimisers, learning rates and number of updates; the networks are saved apart."""

@@ -281,7 +281,7 @@ class DualRunner(OnPolicyRunner):
                 self.current_learning_iteration = content["iteration"]
                 self.wall_seconds = float(content["wall_seconds"])
             else:
-                self.alg.begin_slowly()
+                self.alg.begin_anew()
                 fresh.append("optimisers")
             mine = self._share_of(content)
             if content["learner"]:
