@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import pytest
 
@@ -28,6 +28,7 @@ class Outer:
 def change_all(config: Any) -> Any:
     """A copy in which every leaf differs from its default."""
     changes: dict[str, Any] = {}
+    hints = get_type_hints(type(config))
     for f in dataclasses.fields(config):
         value = getattr(config, f.name)
         if dataclasses.is_dataclass(value):
@@ -35,7 +36,7 @@ def change_all(config: Any) -> Any:
         elif isinstance(value, bool):
             changes[f.name] = not value
         elif isinstance(value, tuple):
-            changes[f.name] = tuple(v + type(v)(1) for v in value) or ("new",)
+            changes[f.name] = tuple(v + type(v)(1) for v in value) or (get_args(hints[f.name])[0](1),)
         else:
             changes[f.name] = value + type(value)(1)
     return dataclasses.replace(config, **changes)
