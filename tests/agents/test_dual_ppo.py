@@ -450,5 +450,5 @@ def test_trained_networks_go_on_slowly_and_as_wide_as_they_are_told():
 
 
 def test_a_spread_for_another_number_of_agents_is_refused():
-    with pytest.raises(ValueError, match=r"ppo.restart_std must be one for each of lower, upper, got 1: \(0.25,\)"):
-        make_learner(restart_std=(0.25,)).begin_anew()
+    with pytest.raises(ValueError, match=r"ppo.restart_std must be one for each of lower, upper, got \(0.25,\)"):
+        make_learner(restart_std=(0.25,))

@@ -136,6 +136,9 @@ class DualPPO:
         self.guide, self.ranks = guide, ranks or Ranks()
         self.dtype = resolve_precision(cfg.precision, device)
         self.names = tuple(layout.action_slices)
+        stds = cfg.restart_std
+        if stds and len(stds) != len(self.names):
+            raise ValueError(f"ppo.restart_std must be one for each of {', '.join(self.names)}, got {stds}")
         self.model = DualActorCritic(layout, cfg.hidden, cfg.initial_std).to(device)
         self.learning_rates = dict.fromkeys(self.names, cfg.learning_rate)
         self.optimizers = {
