@@ -9,10 +9,11 @@ from cotap.envs.disturbances import Assistance, AssistConfig, HandForceConfig, H
 
 DT = 0.02
 STRONG = torch.full((2, 4), 1e6)
+HANDS_H = torch.tensor([[0.3, 0.2, 0.1], [0.3, -0.2, 0.1]])
 
 
 def forces(num_envs=1, **cfg) -> HandForces:
-    return HandForces(HandForceConfig(**{"curriculum_start": 1.0, **cfg}), num_envs, 2, DT)
+    return HandForces(HandForceConfig(**{"curriculum_start": 1.0, **cfg}), HANDS_H, num_envs, DT)
 
 
 def everyone(n) -> torch.Tensor:
@@ -47,6 +48,22 @@ def test_forces_of_any_direction_are_even_in_size_and_direction_and_within_their
         assert float((along[:, :, axis] < 0.5).float().mean()) == pytest.approx(0.75, abs=0.01)
         assert float((along[:, :, axis] < -0.5).float().mean()) == pytest.approx(0.25, abs=0.01)
     assert abs(float(torch.corrcoef(force[:, :, 0].T)[0, 1])) < 0.05  # hands differ
+
+
+@pytest.mark.parametrize("size", [0.0, 40.0])
+def test_the_draw_that_turns_most_is_taken(rng, size):
+    def turn(n, of):
+        hands = forces(n, size=size, most_turning_of=of)
+        hands.reset(everyone(n), rng)
+        left, right = hands.current(torch.zeros(n, 2, 3, 4), STRONG).unbind(1)
+        # About the vertical, by hand: x F_y - y F_x, hands at (0.3, +-0.2).
+        return (0.3 * (left[:, 1] + right[:, 1]) - 0.2 * (left[:, 0] - right[:, 0])).abs()
+
+    # The greatest of three even draws in a row is distributed as the maximum of three single ones.
+    single, taken = turn(60_000, 1).unflatten(0, (-1, 3)).amax(1), turn(20_000, 3)
+    for share in (0.1, 0.5, 0.9):
+        assert float(taken.quantile(share)) == pytest.approx(float(single.quantile(share)), rel=0.03)
+    assert float(taken.mean()) > 1.5 * float(turn(20_000, 1).mean())
 
 
 def test_forces_hold_for_their_time(rng):
@@ -204,6 +221,7 @@ def test_assist_wrench_by_hand(errors, force, torque):
     [
         (HandForceConfig(force_x=(1.0, -1.0)), "hand_forces.force_x"),
         (HandForceConfig(torque_share=2.0), "hand_forces.torque_share"),
+        (HandForceConfig(most_turning_of=0), "hand_forces.most_turning_of"),
         (HandForceConfig(hold_s=(0.0, 1.0)), r"hand_forces.hold_s\[0\]"),
         (AssistConfig(full_samples=9.0, end_samples=5.0), "assist.full_samples"),
         (AssistConfig(velocity_gain=math.nan), "assist.velocity_gain"),

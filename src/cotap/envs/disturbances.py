@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
-from cotap.checks import require_interval, require_range
+from cotap.checks import require_interval, require_positive_int, require_range
 from cotap.envs.persistence import Stateful, uniform
 
 
@@ -27,6 +27,8 @@ class HandForceConfig:
     """[N]."""
     size: float = 0.0
     """Above zero: forces in any direction, of a size up to this, evenly drawn, instead of axis by axis [N]."""
+    most_turning_of: int = 1
+    """So many are drawn, and the one that turns the robot most about the vertical is taken."""
     zero_probability: float = 0.25
     """Chance of each axis of each hand to be free."""
     hold_s: tuple[float, float] = (3.0, 5.0)
@@ -46,6 +48,7 @@ class HandForceConfig:
             require_interval(f"hand_forces.{name}", getattr(self, name))
         require_range("hand_forces.hold_s[0]", self.hold_s[0], 0.02, 1e6)
         require_range("hand_forces.size", self.size, 0.0, 1000.0)
+        require_positive_int("hand_forces.most_turning_of", self.most_turning_of)
         for name in (
             "episode_share",
             "zero_probability",
@@ -58,14 +61,21 @@ class HandForceConfig:
 
 
 class HandForces(Stateful):
-    """Piecewise constant forces at each hand, with a curriculum per world."""
+    """Piecewise constant forces at each hand, with a curriculum per world.
+
+    Args:
+        cfg: What is drawn.
+        hands_h: (hands, 3) where hands usually are, from the torso, heading frame [m].
+        num_envs: Number of worlds.
+        dt: Control step [s].
+    """
 
     STATE = ("_force_h", "_remaining_s", "_loaded", "scale")
 
-    def __init__(self, cfg: HandForceConfig, num_envs: int, num_hands: int, dt: float) -> None:
+    def __init__(self, cfg: HandForceConfig, hands_h: torch.Tensor, num_envs: int, dt: float) -> None:
         cfg.check()
-        self.cfg, self._dt = cfg, dt
-        self._force_h = torch.zeros(num_envs, num_hands, 3)
+        self.cfg, self._hands_h, self._dt = cfg, hands_h, dt
+        self._force_h = torch.zeros(num_envs, len(hands_h), 3)
         self._remaining_s = torch.zeros(num_envs)
         self._loaded = torch.ones(num_envs, dtype=torch.bool)
         self.scale = torch.full((num_envs,), cfg.curriculum_start)
@@ -85,7 +95,10 @@ class HandForces(Stateful):
         n = int(mask.sum())
         if n == 0:
             return
-        self._force_h[mask] = self._any_direction(n, rng) if self.cfg.size > 0.0 else self._by_axis(n, rng)
+        draw = self._any_direction if self.cfg.size > 0.0 else self._by_axis
+        force = draw(n * self.cfg.most_turning_of, rng).unflatten(0, (n, -1))
+        turn = torch.linalg.cross(self._hands_h.expand_as(force), force)[..., 2].sum(-1).abs()
+        self._force_h[mask] = force[torch.arange(n, device=rng.device), turn.argmax(1)]
         self._remaining_s[mask] = uniform(rng, *self.cfg.hold_s, n)
 
     def _by_axis(self, n: int, rng: torch.Generator) -> torch.Tensor:

@@ -216,7 +216,8 @@ class H1Env(VecEnv):
         )
         self.motions = ReferenceMotion(cfg.motions, spec, n, self.dt)
         self.path = PathFollower(cfg.impedance, n, self.dt)
-        self.hand_forces = HandForces(cfg.hand_forces, n, len(spec.arms), self.dt)
+        usual_hands_h = self.reader.arm_chains.pose(self.reader.arm_joints(self._default.unsqueeze(0))).tip[0]
+        self.hand_forces = HandForces(cfg.hand_forces, usual_hands_h, n, self.dt)
         self.blows = Blows(cfg.blows, n, len(spec.arms), self.dt)
         self.scripted = ScriptedForces(cfg.force, tuple(arm.side for arm in spec.arms), n, self.dt)
         self.punches = Punches(cfg.punches, n, self.num_actions - self.num_lower, self.dt)
