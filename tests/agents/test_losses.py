@@ -106,6 +106,11 @@ def test_clipped_value_loss_is_the_mean_over_samples():
     torch.testing.assert_close(clipped_value_loss(value, old, target, 0.2), loss.mean())
 
 
+def test_value_loss_without_clipping_is_the_mean_squared_error():
+    value, old, target = torch.tensor([[1.0, -3.0], [0.0, 0.0], [3.0, -2.0]], dtype=torch.float64)
+    assert float(clipped_value_loss(value, old, target, 0.0)) == pytest.approx((2.0**2 + 1.0**2) / 2)
+
+
 def test_advantages_of_three_steps_by_hand():
     rewards, values = torch.tensor([[1.0], [2.0], [3.0]]), torch.tensor([[0.5], [1.0], [1.5]])
     last, going = torch.tensor([4.0]), torch.zeros(3, 1, dtype=torch.bool)

@@ -20,7 +20,8 @@ def lively() -> H1EnvConfig:
     cfg.force = ForceProfile((3.0, 0.0, 0.0), "both", 0.5, 2.0, 0.7, True, "base")
     for part in (cfg.assist, cfg.hand_forces, cfg.blows, cfg.randomization, cfg.observations.noise):
         part.enabled = True
-    cfg.impedance.share = 0.5
+    cfg.impedance.share = cfg.retries.share = 0.5
+    cfg.hand_forces.hold_s, cfg.hand_forces.most_turning_of, cfg.hand_forces.episode_share = (1.0, 2.0), 3, 0.5
     return cfg
 
 

@@ -53,7 +53,9 @@ class DualPPOConfig:
     lam: float = 0.95
     """Trace decay of the advantage estimates."""
     clip: float = 0.2
-    """Clip range of the surrogate and of values."""
+    """Clip range of the surrogate."""
+    value_clip: float = 0.2
+    """Values are learnt no further than this from what they were when the rollout began; 0 for any distance."""
     entropy: float = 0.002
     """Weight of the entropy bonus."""
     value: float = 1.0
@@ -93,7 +95,7 @@ class DualPPOConfig:
             "max_grad_norm",
         ):
             require_range(f"ppo.{name}", getattr(self, name), 1e-8, 1e6)
-        for name in ("entropy", "value"):
+        for name in ("entropy", "value", "value_clip"):
             require_range(f"ppo.{name}", getattr(self, name), 0.0, 1e3)
         for i, std in enumerate(self.restart_std):
             require_range(f"ppo.restart_std[{i}]", std, 1e-8, max(self.initial_std, self.least_std))
@@ -285,7 +287,7 @@ class DualPPO:
             kl = gaussian_kl(batch["means"][:, part], old_log_std, mean, log_std).mean()
         log_prob = gaussian_log_prob(batch["actions"][:, part], mean, log_std)
         surrogate = clipped_surrogate(log_prob, batch["log_probs"][:, g], batch["advantages"][:, g], cfg.clip)
-        value_loss = clipped_value_loss(value, batch["values"][:, g], batch["returns"][:, g], cfg.clip)
+        value_loss = clipped_value_loss(value, batch["values"][:, g], batch["returns"][:, g], cfg.value_clip)
         entropy = gaussian_entropy(log_std)
         loss = surrogate + cfg.value * value_loss - cfg.entropy * entropy
         stats = {"surrogate": surrogate.detach(), "value": value_loss.detach(), "entropy": entropy.detach(), "kl": kl}

@@ -36,7 +36,9 @@ def clipped_surrogate(
 
 
 def clipped_value_loss(value: torch.Tensor, old_value: torch.Tensor, target: torch.Tensor, clip: float) -> torch.Tensor:
-    """Mean squared value error (scalar), pessimistic about moves of more than `clip`."""
+    """Mean squared value error (scalar), pessimistic about moves of more than `clip`; 0 for any move."""
+    if clip == 0.0:
+        return (value - target).square().mean()
     clipped = old_value + (value - old_value).clamp(-clip, clip)
     return torch.maximum((value - target).square(), (clipped - target).square()).mean()
 

@@ -46,6 +46,7 @@ from cotap.envs.persistence import on_processor, restored, uniform
 from cotap.envs.punches import PunchConfig, Punches
 from cotap.envs.randomization import RandomizationConfig, Randomizer
 from cotap.envs.reference import ReferenceConfig, ReferenceMotion
+from cotap.envs.retries import Retries, RetryConfig, take_over
 from cotap.envs.rewards import LowerRewards, RewardGroup, StepRecord, UpperRewards, check_weights
 from cotap.envs.state import RobotState, StateReader
 from cotap.envs.step_timing import StepTiming
@@ -112,6 +113,7 @@ class H1EnvConfig:
     force: ForceProfile = field(default_factory=ForceProfile)
     punches: PunchConfig = field(default_factory=PunchConfig)
     assist: AssistConfig = field(default_factory=AssistConfig)
+    retries: RetryConfig = field(default_factory=RetryConfig)
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
@@ -127,6 +129,7 @@ class H1EnvConfig:
         for part in (
             self.actions, self.upper_body, self.observations, self.commands, self.motions, self.impedance,
             self.terminations, self.hand_forces, self.blows, self.force, self.punches, self.assist,
+            self.retries,
         ):  # fmt: skip
             part.check()
         self.randomization.check(self.control_dt)
@@ -222,6 +225,7 @@ class H1Env(VecEnv):
         self.scripted = ScriptedForces(cfg.force, tuple(arm.side for arm in spec.arms), n, self.dt)
         self.punches = Punches(cfg.punches, n, self.num_actions - self.num_lower, self.dt)
         self.assistance = Assistance(cfg.assist, self._worlds_in_all, self.dt)
+        self.retries = Retries(cfg.retries, n, self.dt) if cfg.retries.share > 0.0 else None
         self.randomizer = Randomizer(cfg.randomization, spec, self.sim)
         self.upper_body = UpperBody(cfg.upper_body, spec, n, self.dt)
         self.targets = DelayedTargets(n, self.num_actions, cfg.substeps, self.dt)
@@ -371,8 +375,23 @@ class H1Env(VecEnv):
             self._finish(done, fell & ~thrown)
             self._restart(done)
         self._observe(done)
+        if self.retries:
+            self._try_again(self.retries, fell, done)
         extras = {"time_outs": time_out, "falls": fell, "group_rewards": rewards, "log": log}
         return self._observations, rewards.sum(1), done, extras
+
+    def _try_again(self, retries: Retries, fell: torch.Tensor, done: torch.Tensor) -> None:
+        """Take some of the worlds that fell back to where they were before; what they learn of loads by falling, the
+        curriculum, is not taken back."""
+        ids, past = retries.draw(fell, done, self.rng)
+        if len(ids):
+            shares = self.hand_forces.scale, self.blows.scale
+            state = self._worlds()
+            take_over(state, past, ids, self.num_envs)
+            self._load_worlds(state)
+            self.hand_forces.scale, self.blows.scale = shares
+        if retries.due():
+            retries.keep(self._worlds())
 
     def _follow_path(self) -> None:
         """Where the torso is led along a path, that sets the velocity command."""
@@ -411,8 +430,27 @@ class H1Env(VecEnv):
 
     def state_dict(self) -> dict[str, Any]:
         """All that the environment's future depends on, on the processor whatever the device."""
+        state = self._worlds() | {
+            "counters": {"samples": self.samples, "num_diverged": self.num_diverged},
+            "rng": self.rng.get_state(),
+        }
+        return on_processor(state | ({"retries": self.retries.state_dict()} if self.retries else {}))
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on exactly where `state_dict` was taken; on another kind of device or with another backend, with its own
+        arithmetic and random numbers. Raises ValueError for another number of worlds."""
+        self._load_worlds(state)
+        self.samples = state["counters"]["samples"]
+        self.num_diverged = state["counters"]["num_diverged"]
+        if state["rng"].shape == self.rng.get_state().shape:
+            self.rng.set_state(state["rng"].cpu())
+        if self.retries:
+            self.retries.load_state_dict(state.get("retries", {}))
+
+    def _worlds(self) -> dict[str, Any]:
+        """What all worlds are in: copies, with worlds first, but for what they share."""
         snapshot = self.sim.snapshot()
-        state = {
+        return {
             "sim": {"state": snapshot.state, "sensors": snapshot.sensors, "fields": snapshot.fields},
             "parts": {name: part.state_dict() for name, part in self._parts().items()},
             "delay": {
@@ -423,15 +461,11 @@ class H1Env(VecEnv):
             "episode_length": self.episode_length_buf.clone(),
             "last_action": self._last_action.clone(),
             "mean_error": self._mean_error.clone(),
-            "observations": dict(self._observations.items()),
-            "counters": {"samples": self.samples, "num_diverged": self.num_diverged},
-            "rng": self.rng.get_state(),
+            "observations": {k: cast(torch.Tensor, v).clone() for k, v in self._observations.items()},
         }
-        return on_processor(state)
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on exactly where `state_dict` was taken; on another kind of device or with another backend, with its own
-        arithmetic and random numbers. Raises ValueError for another number of worlds."""
+    def _load_worlds(self, state: dict[str, Any]) -> None:
+        """Take over what `_worlds` returned."""
         self.sim.restore(Snapshot(**state["sim"]))
         # Where the clock could not jump before, it has not jumped; loads that were not sensed were none.
         new = {"step_timing", "load_sense"} - state["parts"].keys()
@@ -447,10 +481,6 @@ class H1Env(VecEnv):
         present = {k: cast(torch.Tensor, v) for k, v in self._observations.items()}
         saved = {k: restored(f"observations.{k}", state["observations"][k], v) for k, v in present.items()}
         self._observations = TensorDict(saved, batch_size=[self.num_envs])
-        self.samples = state["counters"]["samples"]
-        self.num_diverged = state["counters"]["num_diverged"]
-        if state["rng"].shape == self.rng.get_state().shape:
-            self.rng.set_state(state["rng"].cpu())
         self.state = self.reader.read()
 
     def progress(self) -> dict[str, float]:

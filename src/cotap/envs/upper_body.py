@@ -100,7 +100,9 @@ class UpperBody(Stateful):
     mixed with the one before it by the time that each holds, as with PD targets.
     """
 
-    STATE = ("fresh", "_hold_s", "_anchor", "_feedforward", "_elastic", "_stiffness", "_damping")
+    PAIRED = ("_anchor", "_feedforward", "_elastic", "_stiffness", "_damping")
+    """Of the command before and the newest: (2, N, ...)."""
+    STATE = ("fresh", "_hold_s", *PAIRED)
 
     def __init__(
         self, cfg: UpperBodyConfig, spec: RobotSpec, num_envs: int, dt: float, dtype: torch.dtype = torch.float32
@@ -197,7 +199,7 @@ class UpperBody(Stateful):
         )
         new, self.log = self._ask(arms)
         tensors = (new.anchor, new.feedforward, new.elastic, new.stiffness, new.damping)
-        for name, value in zip(self.STATE[2:], tensors, strict=True):
+        for name, value in zip(self.PAIRED, tensors, strict=True):
             held: torch.Tensor = getattr(self, name)
             before = torch.where(self.fresh.reshape(-1, *[1] * (value.dim() - 1)), value, held[1])
             setattr(self, name, torch.stack((before, value)))

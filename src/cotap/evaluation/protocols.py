@@ -99,6 +99,6 @@ class VelocityTracking:
         f = env.hand_forces
         f.enabled, f.size = self.hand_force > 0.0 or self.hand_force_size > 0.0, self.hand_force_size
         f.force_x = f.force_y = f.force_z = (-self.hand_force, self.hand_force)
-        f.zero_probability, f.curriculum_start, f.episode_share = 0.0, 1.0, 1.0
+        f.zero_probability, f.curriculum_start = 0.0, 1.0
         f.curriculum_step = f.curriculum_back = 0.0
         return env

@@ -125,9 +125,13 @@ class Simulation(ABC):
         require_shape("snapshot.state", snapshot.state, (self.num_envs, state_size(self.model)))
         if snapshot.fields.keys() != self._fields.keys():
             raise ValueError(f"snapshot has fields {sorted(snapshot.fields)}, not {sorted(self._fields)}")
+        constants_change = False
         for name, value in snapshot.fields.items():
-            self._fields[name].copy_(require_shape(f"snapshot.fields[{name}]", value, tuple(self._fields[name].shape)))
-        if {"body_mass", "body_inertia"} & self._fields.keys():
+            field = self._fields[name]
+            require_shape(f"snapshot.fields[{name}]", value, tuple(field.shape))
+            constants_change |= name in {"body_mass", "body_inertia"} and not torch.equal(field, value.to(field))
+            field.copy_(value)
+        if constants_change:  # which takes longer than all else
             self.update_constants()
         self._write_state(snapshot.state)
         self.sensors.copy_(snapshot.sensors)
