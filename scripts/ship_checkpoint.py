@@ -9,7 +9,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from cotap.agents.checkpoint import load_checkpoint, save_checkpoint, sha256, write_json
+from cotap.checks import require_one_of
 from cotap.configs import BaseTraining, DistillTraining, from_plain, to_plain
 from cotap.evaluate import main as evaluate
 from cotap.evaluation.policy import checkpoint_path, find_checkpoint
@@ -132,8 +135,47 @@ def scaled(content: dict[str, Any], factors: dict[str, float]) -> dict[str, Any]
     return content | {"model": model}
 
 
+COMMANDS = {"forward": ("command_velocity", 0), "sideways": ("command_velocity", 1), "turning": ("command_yaw_rate", 0)}
+"""Which number of which term of an observation a command is."""
+
+
+def told_more(content: dict[str, Any], gains: dict[str, float]) -> dict[str, Any]:
+    """A checkpoint whose networks see commands times a gain: a policy that follows a command by 0.9 of it follows, told
+    1.1 of it, more closely.
+
+    Raises:
+        ValueError: a key is not in `COMMANDS`, or a gain is not within 0.5 to 2.
+    """
+    model = dict(content["model"])
+    for key, gain in gains.items():
+        require_one_of("command", key, COMMANDS)
+        if not 0.5 <= gain <= 2.0:
+            raise ValueError(f"command {key!r} can be told 0.5 to 2 times, got {gain}")
+        # Of a number g x, normalised by mean m and deviation s, (g x - m) / s is what x gives by m / g and s / g.
+        for part, power in (("_mean", 1), ("_std", 1), ("_var", 2)):
+            name = f"normalizers.policy.{part}"
+            model[name] = model[name].clone()
+            model[name][:, columns_of(content["layout"], *COMMANDS[key])] /= gain**power
+    return content | {"model": model}
+
+
+def columns_of(layout: dict[str, Any], term: str, place: int) -> list[int]:
+    """Where an observation has number `place` of a term, once for every step of its history."""
+    start, steps = 0, layout["history"]
+    for name, width, _ in layout["terms"]:
+        if name == term:
+            return [start + place + width * step for step in range(steps)]
+        start += width * steps
+    raise ValueError(f"policies that do not see {term!r} cannot be told more of it")
+
+
 def ship(
-    source: Path, name: str, before: list[Path], changes: dict[str, float | bool], factors: dict[str, float]
+    source: Path,
+    name: str,
+    before: list[Path],
+    changes: dict[str, float | bool],
+    factors: dict[str, float],
+    gains: dict[str, float],
 ) -> int:
     """Strip, save, describe, evaluate. Returns the exit status.
 
@@ -141,7 +183,7 @@ def ship(
     """
     known = shipped_description(source)
     earlier = known.get("earlier_runs", []) + earlier_runs(before)
-    content = scaled(load_checkpoint(source), factors)
+    content = told_more(scaled(load_checkpoint(source), factors), gains)
     target = checkpoint_path(name)
     target.parent.mkdir(exist_ok=True)
     # Where the machine keeps the repository is nobody's business.
@@ -159,6 +201,7 @@ def ship(
             "earlier_runs": earlier,
             "changed_after_training": known.get("changed_after_training", {}) | changes,
             "outputs_scaled_after_training": combined(known.get("outputs_scaled_after_training", {}), factors),
+            "commands_scaled_after_training": combined(known.get("commands_scaled_after_training", {}), gains),
             "seed": config["training"]["seed"],
             "iterations": content["iteration"],
             "samples": content["samples"],
@@ -220,10 +263,14 @@ def main() -> int:
         "--scale", nargs="*", default=[], metavar="JOINT=FACTOR",
         help="what the networks send to joints of which this is a part of the name, times a factor",
     )  # fmt: skip
+    parser.add_argument(
+        "--tell", nargs="*", default=[], metavar="COMMAND=GAIN",
+        help=f"what the networks see of a command ({', '.join(COMMANDS)}), times a gain",
+    )  # fmt: skip
     options = parser.parse_args()
     try:
-        changes, factors = settings(options.change), numbers(options.scale)
-        return ship(options.checkpoint, options.name, options.before, changes, factors)
+        changes, factors, gains = settings(options.change), numbers(options.scale), numbers(options.tell)
+        return ship(options.checkpoint, options.name, options.before, changes, factors, gains)
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

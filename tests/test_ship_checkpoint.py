@@ -104,6 +104,35 @@ def test_a_scaled_policy_moves_its_joint_by_that_much_and_the_others_as_before(t
     assert pitch.sum() == 2
 
 
+def test_a_policy_that_is_told_more_acts_as_if_commands_were_larger(tmp_path):
+    content = load_checkpoint(shipped_checkpoint("base"))
+    gains = {"forward": 1.1, "sideways": 0.8, "turning": 1.3}
+    terms, steps = content["layout"]["terms"], content["layout"]["history"]
+    width = content["agents"]["observation_widths"]["policy"]
+    seen = torch.randn(3, width, generator=torch.Generator().manual_seed(0))
+    larger, start = seen.clone(), 0
+    for term, wide, _ in terms:
+        factors = {"command_velocity": [1.1, 0.8], "command_yaw_rate": [1.3]}.get(term, [1.0] * wide)
+        larger[:, start : start + wide * steps] *= torch.tensor(factors).repeat(steps)
+        start += wide * steps
+
+    def act(content: dict, observation: torch.Tensor) -> torch.Tensor:
+        save_checkpoint(tmp_path / "policy.pt", content)
+        return load_policy(tmp_path / "policy.pt")({"policy": observation})
+
+    expected, plain = act(content, larger), act(content, seen)
+    told = act(sc.told_more(content, gains), seen)
+    assert (expected - plain).abs().max() > 0.05
+    # rsl_rl adds 0.01 to the deviation that it divides by.
+    torch.testing.assert_close(told, expected, atol=0.003, rtol=0.003)
+
+
+@pytest.mark.parametrize(("gains", "needle"), [({"up": 1.1}, "'up' is unknown"), ({"forward": 3.0}, "got 3.0")])
+def test_commands_that_cannot_be_told_are_named(gains, needle):
+    with pytest.raises(ValueError, match=needle):
+        sc.told_more(load_checkpoint(shipped_checkpoint("base")), gains)
+
+
 def test_switches_are_changed_too():
     changes = sc.settings([f"{LEANS}=yes", f"{BRACES}=0.05"])
     commands = sc.changed(to_plain(BaseTraining()), "base", changes)["env"]["commands"]
@@ -119,7 +148,7 @@ def test_a_policy_that_is_shipped_already_keeps_its_provenance(tmp_path, monkeyp
     target = tmp_path / "out" / "cotap.pt"
     monkeypatch.setattr(sc, "checkpoint_path", lambda _: target)
     monkeypatch.setattr(sc, "EVALUATIONS", {"cotap": {}})
-    options = ["--name", "cotap", "--change", f"{HOLD_BACK}=0.4", "--scale", "knee=0.9"]
+    options = ["--name", "cotap", "--change", f"{HOLD_BACK}=0.4", "--scale", "knee=0.9", "--tell", "forward=1.1"]
     monkeypatch.setattr(sys, "argv", ["ship_checkpoint.py", "cotap", *options])
     assert sc.main() == 0
     new = json.loads(target.with_suffix(".json").read_text())
@@ -128,6 +157,9 @@ def test_a_policy_that_is_shipped_already_keeps_its_provenance(tmp_path, monkeyp
     assert new["changed_after_training"] == known["changed_after_training"] | {HOLD_BACK: 0.4}
     before = known["outputs_scaled_after_training"]
     assert new["outputs_scaled_after_training"] == pytest.approx(before | {"knee": 0.9 * before["knee"]})
+    assert new["commands_scaled_after_training"]["forward"] == pytest.approx(
+        1.1 * known.get("commands_scaled_after_training", {}).get("forward", 1.0)
+    )
     assert load_policy(target).env_config.commands.step_hold_back_m == 0.4
 
 
