@@ -9,8 +9,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from cotap.agents.checkpoint import load_checkpoint, save_checkpoint, sha256, write_json
 from cotap.checks import require_one_of
 from cotap.configs import BaseTraining, DistillTraining, from_plain, to_plain
