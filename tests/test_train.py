@@ -16,6 +16,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from cotap import train
 from cotap.agents.checkpoint import load_checkpoint, save_checkpoint
+from cotap.agents.runner import sole_writer
 from cotap.configs import BASE_RECIPES, CONTINUATIONS, DISTILL_RECIPES, BaseTraining, from_plain, to_plain
 from cotap.envs import H1Env
 from cotap.envs.rewards import LowerRewards, UpperRewards
@@ -215,6 +216,15 @@ def test_a_used_run_directory_is_refused_with_what_to_do(checkpoint: Path, capsy
     assert f"--resume {checkpoint}" in message
     assert "another --run-dir" in message
     assert tree(checkpoint.parent) == before
+
+
+def test_a_run_directory_in_use_is_refused_before_anything_is_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    with sole_writer(tmp_path):
+        assert run("base", *SMALL, RUN_DIR, tmp_path) == 2
+    assert "another training writes to" in capsys.readouterr().err
+    assert tree(tmp_path) == {}
 
 
 def test_resuming_into_the_directory_of_a_third_run_is_refused(

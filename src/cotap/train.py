@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import platform
 import subprocess
@@ -292,7 +293,7 @@ def _train(stage: str, options: BaseOptions | DistillOptions, base: dict[str, An
 
     from cotap.agents.ranks import Ranks
     from cotap.agents.run_log import say
-    from cotap.agents.runner import CHECKPOINT_PATTERN, DualRunner, check_run_dir
+    from cotap.agents.runner import CHECKPOINT_PATTERN, DualRunner, check_run_dir, sole_writer
     from cotap.envs import H1Env
 
     training, ranks = options.training, Ranks.from_environment()
@@ -325,7 +326,8 @@ def _train(stage: str, options: BaseOptions | DistillOptions, base: dict[str, An
         # Last, so that nothing is left behind when any of the above refuses.
         if ranks.leads:
             check_run_dir(run_dir, resumed if resumed_dir else None)
-        runner.learn(init_at_random_ep_len=True)
+        with sole_writer(run_dir) if ranks.leads else contextlib.nullcontext():
+            runner.learn(init_at_random_ep_len=True)
     if ranks.leads:
         say(f"{runner.current_learning_iteration} iterations, {runner.wall_seconds:.0f} s: {run_dir}")
     return run_dir

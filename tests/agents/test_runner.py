@@ -19,7 +19,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from cotap.agents.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
 from cotap.agents.losses import LOWEST_RATE
-from cotap.agents.runner import DualRunner, TrainingFault, check_run_dir
+from cotap.agents.runner import DualRunner, TrainingFault, check_run_dir, sole_writer
 from cotap.agents.runner_config import RunnerConfig
 from cotap.envs import H1Env, H1EnvConfig
 from cotap.envs.observations import NoiseConfig, ObservationConfig
@@ -575,6 +575,14 @@ def test_a_used_run_directory_is_refused_with_what_to_do(tmp_path: Path):
     assert "--run-dir" in str(error.value)
     check_run_dir(tmp_path, checkpoint(tmp_path, 4))
     assert names(tmp_path) == before
+
+
+def test_a_run_directory_that_another_training_writes_to_is_refused_before_its_first_checkpoint(tmp_path: Path):
+    refused = pytest.raises(ValueError, match=r"another training writes to .*choose another --run-dir")
+    with sole_writer(tmp_path), refused, sole_writer(tmp_path):
+        pass
+    with sole_writer(tmp_path):  # and is free again
+        pass
 
 
 def test_going_on_from_an_older_checkpoint_beside_newer_ones_is_refused(tmp_path: Path):

@@ -8,11 +8,12 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import torch
+from filelock import FileLock, Timeout
 from rsl_rl.env import VecEnv
 from rsl_rl.runners import OnPolicyRunner
 from tqdm import tqdm
@@ -68,6 +69,31 @@ def check_run_dir(run_dir: Path, resumed: Path | None = None) -> None:
     probe = run_dir / ".writable"
     probe.touch()
     probe.unlink()
+
+
+@contextmanager
+def sole_writer(run_dir: Path) -> Iterator[None]:
+    """Keep other trainings out of an existing `run_dir`; the system lets go of it when the process ends, however.
+
+    Raises:
+        ValueError: another training writes to it, which may have saved nothing yet.
+    """
+    lock = FileLock(run_dir / ".lock")
+    try:
+        lock.acquire(timeout=0.0)
+    except Timeout:
+        raise ValueError(
+            f"another training writes to run directory {str(run_dir)!r}: stop that, or choose another --run-dir"
+        ) from None
+    except NotImplementedError:  # file systems without locks
+        yield
+        return
+    try:
+        yield
+    finally:
+        with suppress(OSError):  # where files that are open cannot be removed
+            Path(lock.lock_file).unlink()
+        lock.release()
 
 
 class TrainingFault(RuntimeError):
