@@ -124,7 +124,7 @@ def test_a_policy_that_is_told_more_acts_as_if_commands_were_larger(tmp_path):
     told = act(sc.told_more(content, gains), seen)
     assert (expected - plain).abs().max() > 0.05
     # rsl_rl adds 0.01 to the deviation that it divides by.
-    torch.testing.assert_close(told, expected, atol=0.003, rtol=0.003)
+    torch.testing.assert_close(told, expected, atol=0.01, rtol=0.0)
 
 
 @pytest.mark.parametrize(("gains", "needle"), [({"up": 1.1}, "'up' is unknown"), ({"forward": 3.0}, "got 3.0")])
