@@ -295,6 +295,8 @@ class H1Env(VecEnv):
         """Restart every world and return the observations."""
         self._restart(self._everyone)
         self._observe(self._everyone)
+        if self.retries:
+            self.retries.load_state_dict({})  # nobody goes back beyond this
         return self._observations
 
     def reset_alike(self, seed: int) -> TensorDict:

@@ -88,8 +88,9 @@ class Retries:
         return {"step": self._step, "begun": self._begun.clone(), "past": [list(p) for p in self._past]}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over what `state_dict` returned; without, begin with nothing kept. Raises ValueError for another number
-        of worlds."""
+        """Take over what `state_dict` returned; of an empty one, keep nothing of before. Raises ValueError for another
+        number of worlds."""
+        self._past.clear()
         if state:
             self._begun = restored("retries.begun", state["begun"], self._begun)
             self._step = state["step"]
