@@ -1,6 +1,7 @@
 """Average the weights of policies of one layout that have an ancestor in common: what each learned on its way from it
-adds, and what is noise of its last updates cancels (Wortsman et al. 2022, "Model soups"). The result is a checkpoint
-without optimiser state, beside it a JSON that says what it was made of."""
+adds, and what is noise of its last updates cancels (Wortsman et al. 2022, "Model soups"). Shares below zero go on along
+the way from one to another: `NEW=2 OLD=-1` goes as far again. The result is a checkpoint without optimiser state,
+beside it a JSON that says what it was made of."""
 
 from __future__ import annotations
 
@@ -25,13 +26,15 @@ from cotap.train import provenance
 
 EMPTY = {"learner": {}, "env": {}, "others": []}
 """What an average has none of: optimisers' moments and simulations belong to one run."""
+LARGEST = 5.0
+"""A share beyond this is a slip."""
 
 
 def average(states: list[dict[str, torch.Tensor]], shares: list[float]) -> dict[str, torch.Tensor]:
     """Weighted sum of states, tensor by tensor; counts are the first's.
 
     Raises:
-        ValueError: states differ in names or shapes.
+        ValueError: states differ in names or shapes, or shares below zero leave a deviation below zero.
     """
     if any(state.keys() != states[0].keys() for state in states):
         names = [set(state) for state in states]
@@ -45,6 +48,8 @@ def average(states: list[dict[str, torch.Tensor]], shares: list[float]) -> dict[
             raise ValueError(f"{name} has not one shape in all checkpoints: {[tuple(t.shape) for t in tensors]}")
         stacked = torch.stack([tensor.double() for tensor in tensors], dim=-1)
         mean[name] = (stacked @ weights).to(first.dtype) if first.is_floating_point() else first
+        if name.endswith(("._std", "._var")) and (mean[name] < 0.0).any():
+            raise ValueError(f"with shares of {', '.join(f'{share:g}' for share in shares)} {name} is negative")
     return mean
 
 
@@ -52,18 +57,20 @@ def parse(text: str) -> tuple[Path, float]:
     """PATH=SHARE.
 
     Raises:
-        ValueError: no share, or one outside 0 to 1.
+        ValueError: no share, or one that is zero or beyond `LARGEST`.
     """
     path, _, share = text.rpartition("=")
-    if not path or not 0.0 < float(share) <= 1.0:
-        raise ValueError(f"{text!r} is not CHECKPOINT=SHARE with a share above 0 and up to 1")
+    if not path or not 0.0 < abs(float(share)) <= LARGEST:
+        raise ValueError(
+            f"{text!r} is not CHECKPOINT=SHARE with a share that is not 0 and within -{LARGEST:g} to {LARGEST:g}"
+        )
     return Path(path), float(share)
 
 
 def origin(path: Path, share: float, content: dict[str, Any]) -> dict[str, Any]:
     """What is remembered of a checkpoint that went into an average."""
     config = content["config"]
-    kept = {key: config[key] for key in ("averaged",) if key in config}
+    kept = {key: config[key] for key in ("averaged", "merged") if key in config}
     return {
         "checkpoint": str(path),
         "sha256": sha256(path),
@@ -95,6 +102,7 @@ def run(parts: list[str], output: Path, command: str) -> None:
     made = provenance(command, "mjbatch") | {"averaged": origins}
     made.pop("simulation")  # nothing was simulated
     config = first["config"] | made
+    config.pop("merged", None)  # told of the first, among its origins
     model = average([content["model"] for content in contents], list(shares))
     save_checkpoint(output, first | EMPTY | {"model": model, "config": config})
     described = {key: config[key] for key in ("command", "commit", "averaged")}

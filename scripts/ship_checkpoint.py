@@ -196,6 +196,7 @@ def ship(
             "commit": config["commit"],
             "command": config["command"],
             "averaged": config.get("averaged", []),
+            "merged": config.get("merged", {}),
             "earlier_runs": earlier,
             "changed_after_training": known.get("changed_after_training", {}) | changes,
             "outputs_scaled_after_training": combined(known.get("outputs_scaled_after_training", {}), factors),

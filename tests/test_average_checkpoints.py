@@ -34,6 +34,18 @@ def test_average_by_hand():
     assert mean["n"] == 3  # counts are the first's
 
 
+def test_shares_below_zero_go_on_by_hand():
+    states = [{"w": torch.tensor([1.0, 4.0])}, {"w": torch.tensor([5.0, 0.0])}]
+    assert ac.average(states, [2.0, -1.0])["w"].tolist() == [-3.0, 8.0]
+
+
+@pytest.mark.parametrize("name", ["normalizers.policy._std", "normalizers.policy._var"])
+def test_deviations_that_would_be_negative_are_refused(name):
+    states = [{name: torch.tensor([1.0, 0.4])}, {name: torch.tensor([0.5, 1.0])}]
+    with pytest.raises(ValueError, match=f"2, -1 {name} is negative"):
+        ac.average(states, [2.0, -1.0])
+
+
 def test_average_of_shipped_policies_is_a_policy_and_says_what_it_is_made_of(tmp_path, monkeypatch):
     out = tmp_path / "mean.pt"
     assert run(monkeypatch, f"{COTAP}=0.75", f"{BASE}=0.25", "--output", out) == 0
@@ -56,7 +68,7 @@ def test_average_of_shipped_policies_is_a_policy_and_says_what_it_is_made_of(tmp
     [
         (("=0.5", "=0.4"), "shares add up to 0.9"),
         (("=0", "=1"), "=0' is not CHECKPOINT=SHARE"),
-        (("=1.5", "=-0.5"), "=1.5' is not CHECKPOINT=SHARE"),
+        (("=5.5", "=-4.5"), "=5.5' is not CHECKPOINT=SHARE"),
         (("=nan", "=1"), "is not CHECKPOINT=SHARE"),
         (("", "=1"), "is not CHECKPOINT=SHARE"),
         (("=half", "=0.5"), "half"),

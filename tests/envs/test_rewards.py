@@ -133,6 +133,10 @@ CASES = [
     ("upright", {"projected_gravity_t": [[0.1, 0.1, -math.sqrt(0.98)]], "load_tilt": [[-0.1, -0.15]]}, 0.05**2),
     ("vertical_velocity", {"torso_linear_velocity_h": [[0.5, -0.2, -0.3]]}, 0.09),
     ("roll_pitch_rate", {"torso_angular_velocity_t": [[0.3, -0.4, 7.0]]}, 0.25),
+    # Commanded to turn at 0.4 rad/s: half a radian per second off is free, 3.5 off the worst.
+    ("spin", {"yaw_rate": [-0.1]}, 0.0),
+    ("spin", {"yaw_rate": [-0.8]}, 0.7),
+    ("spin", {"yaw_rate": [6.0]}, 3.0),
     ("contact_schedule", {"foot_force": [[250.0, 4.9]]}, 0.5),
     ("contact_schedule", {"desired_contact": [[False, False]]}, 0.0),
     ("contact_schedule", {"foot_force": [[250.0, 0.0]], "desired_contact": [[True, False]]}, 1.0),

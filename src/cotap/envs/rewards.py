@@ -81,6 +81,7 @@ class LowerRewards:
     upright: float = -15.0
     vertical_velocity: float = -1.0
     roll_pitch_rate: float = -0.3
+    spin: float = 0.0
     contact_schedule: float = 1.0
     swing_height: float = -15.0
     foot_slip: float = -1.0
@@ -186,6 +187,11 @@ def vertical_velocity(s: StepRecord) -> torch.Tensor:
 def roll_pitch_rate(s: StepRecord) -> torch.Tensor:
     """Squared angular velocity of the torso about its horizontal axes."""
     return s.state.torso_angular_velocity_t[:, :2].square().sum(1)
+
+
+def spin(s: StepRecord) -> torch.Tensor:
+    """How far beyond 0.5 rad/s the yaw rate is off, at most 3: a way back from where its kernels are flat."""
+    return ((s.command.yaw_rate - s.state.yaw_rate).abs() - 0.5).clamp(0.0, 3.0)
 
 
 def contact_schedule(s: StepRecord) -> torch.Tensor:
@@ -357,6 +363,7 @@ TERMS: dict[str, Callable[[StepRecord], torch.Tensor]] = {
         upright,
         vertical_velocity,
         roll_pitch_rate,
+        spin,
         contact_schedule,
         swing_height,
         foot_slip,
