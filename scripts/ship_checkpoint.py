@@ -167,6 +167,15 @@ def columns_of(layout: dict[str, Any], term: str, place: int) -> list[int]:
     raise ValueError(f"policies that do not see {term!r} cannot be told more of it")
 
 
+def without_folder(value: Any) -> Any:
+    """Plain data with paths from the repository's folder on: where the machine keeps it is nobody's business."""
+    if isinstance(value, dict):
+        return {key: without_folder(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [without_folder(entry) for entry in value]
+    return value.replace(f"{Path.cwd()}/", "") if isinstance(value, str) else value
+
+
 def ship(
     source: Path,
     name: str,
@@ -184,8 +193,7 @@ def ship(
     content = told_more(scaled(load_checkpoint(source), factors), gains)
     target = checkpoint_path(name)
     target.parent.mkdir(exist_ok=True)
-    # Where the machine keeps the repository is nobody's business.
-    config = content["config"] | {"command": content["config"]["command"].replace(f"{Path.cwd()}/", "")}
+    config = without_folder(content["config"])
     config["training"] = changed(config["training"], content["kind"], changes)
     save_checkpoint(target, content | {"learner": {}, "env": {}, "others": [], "config": config})
     write_json(
