@@ -371,11 +371,11 @@ def test_bad_input_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cap
 
 @pytest.mark.slow
 def test_robots_that_sense_loads_are_dragged_less() -> None:
-    """The shipped base under loads of up to 20 N per axis on both hands, with and without sensing them."""
+    """The shipped base under loads of up to 40 N per axis on both hands, with and without sensing them."""
     policy = load_policy(shipped_checkpoint("base"))
     falls, speed = {}, {}
     for senses in (True, False):
-        cfg = VelocityTracking(num_envs=256, hand_force=20.0, stand_probability=1.0, seed=5).configure(
+        cfg = VelocityTracking(num_envs=256, hand_force=40.0, stand_probability=1.0, seed=5).configure(
             policy.env_config
         )
         cfg.commands.lean_into_loads, cfg.commands.brace_tilt_rad = senses, BRACE_TILT_RAD * senses
