@@ -6,7 +6,6 @@ says what it was made of."""
 from __future__ import annotations
 
 import argparse
-import math
 import shlex
 import sys
 import time
@@ -122,8 +121,7 @@ def teach(student: DualActorCritic, lesson: Lesson, env: H1Env, cfg: Merging) ->
     dtype = resolve_precision("auto", "cpu")
     weights = [*student.actors.parameters(), *student.critics.parameters()]
     optimizer = torch.optim.Adam(weights, lr=cfg.learning_rate, fused=True)
-    per_pass = math.ceil(cfg.steps * cfg.num_envs / math.ceil(cfg.steps * cfg.num_envs / cfg.mini_batches))
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, cfg.iterations * cfg.epochs * per_pass)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, cfg.iterations)
     observations = as_dict(env.reset())
     losses = []
     progress = trange(cfg.iterations, desc="merging")
@@ -150,8 +148,8 @@ def teach(student: DualActorCritic, lesson: Lesson, env: H1Env, cfg: Merging) ->
                 optimizer.zero_grad()
                 loss.backward()
                 optimizer.step()
-                schedule.step()
                 total += loss.detach() * len(ids)
+        schedule.step()
         losses.append(float(total) / (cfg.epochs * len(answers)))
         progress.set_postfix_str(f"off {losses[-1]:.4f} falls/s {falls / (len(answers) * env.dt):.4f}")
     return losses
@@ -175,7 +173,6 @@ def run(calm: Path, loaded: Path, start: Path, output: Path, cfg: Merging, comma
             raise CheckpointError(f"checkpoint {str(path)!r} has other agents than {str(loaded)!r}")
     began = time.monotonic()
     torch.set_num_threads(cfg.threads)
-    torch.manual_seed(cfg.seed)
     policies = {role: load_policy(path) for role, path in paths.items()}
     first = contents["loaded"]
     env_config = policies["loaded"].env_config
@@ -194,12 +191,13 @@ def run(calm: Path, loaded: Path, start: Path, output: Path, cfg: Merging, comma
     }
     config = first["config"] | provenance(command, "auto") | {"merged": merged}
     config.pop("averaged", None)  # told of the second policy, under its name
-    state = first["model"] | student.state_dict()
+    # How wide one explores who goes on from it: as the second policy did.
+    deviations = {name: value for name, value in first["model"].items() if name.startswith("log_std")}
     samples = first["samples"] + cfg.num_envs * cfg.steps * cfg.iterations
     seconds = first["wall_seconds"] + time.monotonic() - began
-    kept = {name: state[name] if not name.startswith("log_std") else first["model"][name] for name in state}
+    model = student.state_dict() | deviations
     save_checkpoint(
-        output, first | EMPTY | {"model": kept, "config": config, "samples": samples, "wall_seconds": seconds}
+        output, first | EMPTY | {"model": model, "config": config, "samples": samples, "wall_seconds": seconds}
     )
     write_json(output.with_suffix(".json"), {key: config[key] for key in ("command", "commit", "merged")})
 

@@ -163,6 +163,13 @@ def test_a_policy_that_is_shipped_already_keeps_its_provenance(tmp_path, monkeyp
     assert load_policy(target).env_config.commands.step_hold_back_m == 0.4
 
 
+def test_where_the_repository_is_kept_is_left_out_however_deep():
+    here = Path.cwd()
+    told = {"a": [{"command": f"run {here}/runs/x.pt={here}/y"}], "n": 3, "t": f"{here.parent}/elsewhere"}
+    left = {"a": [{"command": "run runs/x.pt=y"}], "n": 3, "t": f"{here.parent}/elsewhere"}
+    assert sc.without_folder(told) == left
+
+
 def test_a_description_of_another_checkpoint_is_refused(tmp_path):
     (tmp_path / "c.pt").write_bytes(b"one")
     assert sc.shipped_description(tmp_path / "c.pt") == {}
