@@ -1,10 +1,10 @@
 """How fast: physics, environment and training on this machine, as ratios within one run, beside its peers.
 
 The physics reference is fixed: control steps of four 5 ms `mj_step` of H1 with feet-only contacts in plain mjbatch,
-from the states and with the torques of a recorded rollout of the shipped base policy, and nothing else. Open-loop
-torques soon make a robot fall, so each control step starts from its recorded state (restarts included); only the
-stepping is timed. All figures are control steps (20 ms) per second. Parts are measured in turn, several times over:
-rates are medians over the rounds, ratios are medians of the ratios within rounds.
+from the states and with the torques of a recorded rollout (of the shipped base policy, or of zero actions where none is
+shipped), and nothing else. Open-loop torques soon make a robot fall, so each control step starts from its recorded
+state (restarts included); only the stepping is timed. All figures are control steps (20 ms) per second. Parts are
+measured in turn, several times over: rates are medians over the rounds, ratios are medians of the ratios within rounds.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ from cotap.compliance.interface import ArmState, LawParameters
 from cotap.compliance.inverse_kinematics import ArmIK
 from cotap.compliance.laws import LAWS, LawConfig
 from cotap.configs import BASE_RECIPES, BaseTraining
-from cotap.envs import H1Env, H1EnvConfig
-from cotap.envs.reference import ReferenceConfig, ReferenceMotion
-from cotap.evaluation.policy import find_checkpoint, load_policy
+from cotap.envs import HumanoidEnv
+from cotap.evaluation.policy import find_checkpoint, load_policy, shipped_names
 from cotap.motions import MotionClip, MotionLibrary
+from cotap.motions.reference import ReferenceConfig, ReferenceMotion
 from cotap.robots import RobotSpec, h1
 from cotap.robots.chains import arm_model
 from cotap.robots.mjcf import build_model
@@ -62,11 +62,20 @@ Actor = Callable[[dict[str, torch.Tensor]], torch.Tensor]
 
 @dataclass(frozen=True)
 class Recording:
-    """States before, and torques during, K control steps of N worlds."""
+    """States before, and torques during, K control steps of N envs."""
 
     qpos: np.ndarray
     qvel: np.ndarray
     torque: np.ndarray
+
+
+def actor(checkpoint: str) -> tuple[str, Actor]:
+    """A policy and its name: of a checkpoint, or else the shipped base, or else zero actions."""
+    name = checkpoint or ("h1-base" if "h1-base" in shipped_names() else "")
+    if name:
+        return name, load_policy(find_checkpoint(name))
+    joints = len(h1().joints)
+    return "zero actions", lambda obs: torch.zeros(len(obs["policy"]), joints)
 
 
 def reference_model() -> mujoco.MjModel:
@@ -76,16 +85,17 @@ def reference_model() -> mujoco.MjModel:
     return model
 
 
-def full_env(num_envs: int) -> H1Env:
-    """Everything on, as in training after the gantry is gone; worlds time out at different times."""
-    cfg = H1EnvConfig(num_envs=num_envs, backend="mjbatch")
-    cfg.hand_forces.curriculum_start = 1.0
-    env = H1Env(cfg)
+def full_env(num_envs: int) -> HumanoidEnv:
+    """Everything on that recipe `default` has, as at the end of its training; envs time out at different times."""
+    cfg = BASE_RECIPES["default"]().env
+    cfg.num_envs, cfg.backend = num_envs, "mjbatch"
+    env = HumanoidEnv(cfg)
+    env.samples = 10**9
     env.episode_length_buf = torch.randint_like(env.episode_length_buf, high=env.max_episode_length)
     return env
 
 
-def record(env: H1Env, policy: Actor, warm_up: int, steps: int) -> Recording:
+def record(env: HumanoidEnv, policy: Actor, warm_up: int, steps: int) -> Recording:
     """Let the policy walk, then record."""
     rows: dict[str, list[np.ndarray]] = {"qpos": [], "qvel": [], "torque": []}
     obs = env.get_observations()
@@ -120,9 +130,9 @@ class PhysicsReference:
 
 
 class EnvStepping:
-    """`H1Env.step` with everything on; the policy's own time is not counted."""
+    """`HumanoidEnv.step` with everything on; the policy's own time is not counted."""
 
-    def __init__(self, env: H1Env, policy: Actor, seconds: float) -> None:
+    def __init__(self, env: HumanoidEnv, policy: Actor, seconds: float) -> None:
         self.env, self.policy, self.seconds = env, policy, seconds
 
     def run(self) -> float:
@@ -139,7 +149,7 @@ class EnvStepping:
 class Training:
     """Whole iterations: collecting and learning."""
 
-    def __init__(self, env: H1Env, training: BaseTraining) -> None:
+    def __init__(self, env: HumanoidEnv, training: BaseTraining) -> None:
         self.env = env
         self.alg = DualPPO(layout_of(env), env.num_envs, training.ppo)
 
@@ -157,7 +167,7 @@ class Training:
 
 
 class Compliance:
-    """Both arms of every world, from joint angles to torque: kinematics, stiffness, blend, gravity, two torques."""
+    """Both arms of every env, from joint angles to torque: kinematics, stiffness, blend, gravity, two torques."""
 
     def __init__(self, num_envs: int, seconds: float, law: str = "cotap") -> None:
         self.seconds, self.num_envs, spec = seconds, num_envs, h1()
@@ -187,7 +197,7 @@ class Compliance:
 
 
 class InverseKinematics(Compliance):
-    """Joint targets of both arms of every world for hands that are 2 cm away."""
+    """Joint targets of both arms of every env for hands that are 2 cm away."""
 
     def __init__(self, num_envs: int, seconds: float) -> None:
         super().__init__(num_envs, seconds)
@@ -269,7 +279,7 @@ class PlainEnv(gymnasium.Env):
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
         super().reset(seed=seed, options=options)
         mujoco.mj_resetData(self.model, self.data)
-        self.data.qpos[2] = 1.04
+        self.data.qpos[2] = h1().base_height_m
         return self._observation(), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
@@ -364,7 +374,7 @@ def machine() -> dict[str, Any]:
 
 
 def rates_by_size(sizes: list[int], policy: Actor, seconds: float, repeats: int) -> dict[str, float]:
-    """Environment steps per second at each number of worlds: medians over rounds."""
+    """Environment steps per second at each number of envs: medians over rounds."""
     rates: dict[str, list[float]] = {str(n): [] for n in sizes}
     for _ in range(repeats):
         for n in sizes:
@@ -386,7 +396,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     """Everything that goes into the JSON."""
     torch.manual_seed(0)
     num_envs, seconds, repeats = options.num_envs, options.seconds, options.repeats
-    policy: Actor = load_policy(find_checkpoint(options.checkpoint))
+    name, policy = actor(options.checkpoint)
     memory = peak_memory_mib(num_envs)  # before this process grows, whose size a child's peak begins with
     env = full_env(num_envs)
     recording = record(env, policy, WARM_UP_STEPS, options.steps)
@@ -396,13 +406,13 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     }
     train_env = full_env(num_envs)  # of its own: an untrained policy falls, and would leave the other on the ground
     networks = {"default": "train", "paper": "train_paper"}
-    for name in options.networks:
-        parts[networks[name]] = Training(train_env, BASE_RECIPES[name]()).run
+    for kind in options.networks:
+        parts[networks[kind]] = Training(train_env, BASE_RECIPES[kind]()).run
     parts["reference"] = Reference(num_envs, seconds, 0).run
     parts["reference_10000_clips"] = Reference(num_envs, seconds, 10_000).run
     parts["compliance"] = Compliance(num_envs, seconds).run
-    for name in LAWS:
-        parts[f"law_{name}"] = Compliance(num_envs, seconds, name).run
+    for law in LAWS:
+        parts[f"law_{law}"] = Compliance(num_envs, seconds, law).run
     parts["inverse_kinematics"] = InverseKinematics(num_envs, seconds).run
     parts["compliance_literal"] = LiteralCompliance(num_envs, seconds).run
     parts["mujoco_rollout"] = lambda: rollout_rate(recording, seconds)
@@ -415,7 +425,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     by_size = rates_by_size(options.sizes, policy, seconds, repeats)
     return {
         "num_envs": num_envs,
-        "policy": options.checkpoint,
+        "policy": name,
         "physics_steps_per_s": median["physics"],
         "env_steps_per_s": median["env"],
         "train_steps_per_s": median.get("train"),
@@ -452,11 +462,11 @@ def table(result: dict[str, Any]) -> str:
     reference = result["physics_steps_per_s"]
     rows: list[tuple[str, float | None, float | None]] = [
         ("physics reference", reference, 1.0),
-        (f"environment, {result['num_envs']} worlds", result["env_steps_per_s"], result["env_over_physics"]),
+        (f"environment, {result['num_envs']} envs", result["env_steps_per_s"], result["env_over_physics"]),
         ("training, default networks", result["train_steps_per_s"], result["train_over_physics"]),
         ("training, paper's networks", result["train_paper_steps_per_s"], result["train_paper_over_physics"]),
         *((name, rate, rate / reference) for name, rate in result["peers"].items()),
-        *((f"environment, {n} worlds", r, r / reference) for n, r in result["env_steps_per_s_by_num_envs"].items()),
+        *((f"environment, {n} envs", r, r / reference) for n, r in result["env_steps_per_s_by_num_envs"].items()),
     ]
     lines = ["| what | control steps/s | over physics |", "|---|---|---|"]
     lines += [f"| {name} | {rate:,.0f} | {over:.2f} |" for name, rate, over in rows if rate and over]
@@ -489,7 +499,7 @@ def main() -> int:
     parser.add_argument("--steps", type=int, default=20, help="control steps recorded for the physics reference")
     parser.add_argument("--sizes", type=sizes, default=[512, 1024, 2048, 4096, 8192], help="comma-separated")
     parser.add_argument("--networks", nargs="+", choices=("default", "paper"), default=["default", "paper"])
-    parser.add_argument("--checkpoint", default="base", help="policy to record and drive with, a file or a shipped one")
+    parser.add_argument("--checkpoint", default="", help="policy to record and drive with; by default the shipped base")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--quick", action="store_true", help="small and short: shows that it runs, measures little")
     options = parser.parse_args()

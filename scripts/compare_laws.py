@@ -26,12 +26,13 @@ from cotap.agents.checkpoint import write_json
 from cotap.checks import require_one_of, require_range
 from cotap.compare import difference
 from cotap.configs import to_plain
-from cotap.envs import H1Env, H1EnvConfig
-from cotap.evaluate import ImpactOptions, StaticStiffnessOptions, scenario, static_stiffness
+from cotap.envs import HumanoidEnv, HumanoidEnvConfig
+from cotap.evaluate import Options, RolloutOptions, run
 from cotap.evaluation.disturbance import Impact
 from cotap.evaluation.law_options import LawOptions
+from cotap.evaluation.protocol import HELD
 from cotap.evaluation.report import save_figure
-from cotap.evaluation.scenario import mirrored_pose
+from cotap.evaluation.rollout import idle
 from cotap.evaluation.stability import Stability, energy_summary, exchanged_energy, growth_rates
 from cotap.evaluation.static import StaticStiffness, settle
 from cotap.evaluation.wrong_model import misjudge
@@ -86,8 +87,8 @@ class Static:
     """Worlds per load."""
     settle_seconds: float = 8.0
     """How long a load is left to settle [s]; the last second is measured."""
-    arm_actions: bool = False
-    """Let the policy's own residual move the arms (pelvis free)."""
+    upper_actions: str = "reference"
+    """What moves the arms (pelvis free): policy, or reference for the raw reference."""
     torque_limit_scale: float = 1.0
     """Factor on the robot's torque limits."""
     sensing: str = "privileged"
@@ -95,7 +96,7 @@ class Static:
     threads: int = 0
     """Processor threads; 0 takes every processor."""
     seed: int = 0
-    """Seed of worlds."""
+    """Seed of envs."""
     laws: tuple[str, ...] = AT_REST
     """Rows to measure."""
     output: str = "runs/laws"
@@ -105,23 +106,21 @@ class Static:
         """Downward displacements [m] under the three loads, by row."""
         rows = {}
         for name in self.laws:
-            # 0, 10, ..., 50 N, each in worlds of its own.
+            # 0, 10, ..., 50 N, each in envs of its own.
             protocol = StaticStiffness(
-                force=(0.0, 0.0, -50.0), pelvis=self.pelvis, levels=6, repeats=self.repeats, seed=self.seed,
-                settle_seconds=self.settle_seconds, arm_actions=self.arm_actions,
+                force=(0.0, 0.0, -50.0), pelvis=self.pelvis, levels=6, num_envs=6 * self.repeats, seed=self.seed,
+                settle_seconds=self.settle_seconds, upper_actions=self.upper_actions,
                 torque_limit_scale=self.torque_limit_scale,
             )  # fmt: skip
             laws = laws_of(name, self.stiffness, self.sensing)
-            options = StaticStiffnessOptions(
-                checkpoint=self.checkpoint, threads=self.threads, laws=laws, protocol=protocol
-            )
+            options = Options(protocol, laws, checkpoint=self.checkpoint, threads=self.threads)
             with redirect_stdout(StringIO()):  # its own table
-                result = static_stiffness(options)
+                result = run("static-stiffness", options)
             curve = result["curve"]
             moved = [(_down(curve["displacement"][i]), curve["spread"][i][2]) for i in (1, 3, 5)]
             rows[name] = {
                 "displacement": [m for m, _ in moved],
-                # Of the mean; worlds that fell are few or the mean is none.
+                # Of the mean; envs that fell are few or the mean is none.
                 "half_interval": [1.96 * std / self.repeats**0.5 for _, std in moved],
                 "torque_saturated": result["torque_saturated"],
                 "num_falls": result["num_falls"],
@@ -149,7 +148,7 @@ class Static:
             pairs = zip(row["displacement"], result["ideal"], strict=True)
             if all(got is not None and abs(got / ideal - 1.0) <= 0.1 for got, ideal in pairs):
                 near.append(name)
-        pelvis = f"Pelvis {self.pelvis}, {self.repeats} worlds per load, {self.stiffness:g} N/m."
+        pelvis = f"Pelvis {self.pelvis}, {self.repeats} envs per load, {self.stiffness:g} N/m."
         return "\n".join([*lines, "", f"{pelvis} Within 10 % of ideal at all loads: {'; '.join(near) or 'none'}."])
 
     def draw(self, result: dict[str, Any]) -> Any:
@@ -163,7 +162,7 @@ def _down(displacement: list[float | None]) -> float | None:
 
 @dataclass
 class Transient:
-    """What a hand does after a blow on it, every law (paper, Fig. 9): error over time, energy of its oscillation."""
+    """What a hand does after a push on it, every law (paper, Fig. 9): error over time, energy of its oscillation."""
 
     checkpoint: str = ""
     """Policy of the legs; by default the shipped CoTaP policy."""
@@ -177,14 +176,14 @@ class Transient:
     """stance or walking."""
     pelvis: str = "free"
     """free or fixed."""
-    arm_actions: bool = True
-    """Let the policy's own residual move the arms."""
+    upper_actions: str = "policy"
+    """What moves the arms: policy, or reference for the raw reference."""
     torque_limit_scale: float = 1.0
     """Factor on the robot's torque limits."""
     threads: int = 0
     """Processor threads; 0 takes every processor."""
     seed: int = 0
-    """Seed of worlds."""
+    """Seed of envs."""
     laws: tuple[str, ...] = STRUCK
     """Rows to measure."""
     output: str = "runs/laws"
@@ -197,15 +196,14 @@ class Transient:
             rows = forces[f"{force:g}"] = {}
             for name in self.laws:
                 protocol = Impact(
-                    num_envs=self.num_envs, seed=self.seed, mode=self.mode, pelvis=self.pelvis,
-                    arm_actions=self.arm_actions, torque_limit_scale=self.torque_limit_scale, force=(force, 0.0, 0.0),
+                    num_envs=self.num_envs, seed=self.seed, mode=self.mode, pelvis=self.pelvis, motion=(HELD,),
+                    upper_actions=self.upper_actions, torque_limit_scale=self.torque_limit_scale,
+                    force=(force, 0.0, 0.0),
                 )  # fmt: skip
-                options = ImpactOptions(
-                    checkpoint=self.checkpoint, threads=self.threads, laws=laws_of(name, self.stiffness),
-                    protocol=protocol,
-                )  # fmt: skip
+                laws = laws_of(name, self.stiffness)
+                options = RolloutOptions(protocol, laws, checkpoint=self.checkpoint, threads=self.threads)
                 with redirect_stdout(StringIO()):  # its own table
-                    result = scenario("impact", options)
+                    result = run("impact", options)
                 kept = ("num_envs", "num_falls", "metrics", "window", "curve")
                 rows[name] = {k: result[k] for k in kept} | {
                     "checkpoint_sha256": result["settings"]["checkpoint_sha256"]
@@ -238,7 +236,7 @@ class Transient:
         return "\n".join(lines)
 
     def draw(self, result: dict[str, Any]) -> Any:
-        """The hand's displacement along the blow over time."""
+        """The hand's displacement along the push over time."""
         return draw_transient(result)
 
 
@@ -258,7 +256,7 @@ def _verdicts(rows: dict[str, Any]) -> list[str]:
             out.append(f"- {name}, oscillation beside facet's: not measured ({d['reason']})")
             continue
         low, high = d["ci95"]
-        verdict = "less" if high < 0.0 else "more" if low > 0.0 else "cannot be told apart"
+        verdict = "less" if high < 0.0 else "more" if low > 0.0 else "cannot be distinguished"
         out.append(
             f"- {name}, oscillation beside facet's: **{verdict}**, {d['difference']:+.3f} J/kg "
             f"({low:+.3f} to {high:+.3f})"
@@ -297,14 +295,14 @@ class Properties:
             (soft, stiff, right), at = self._moved(name, (0.5 * k, 2.0 * k, k))
             (wrong,), misled = self._moved(name, (k,), wrong=True)
             arms = laws_of(name, self.stiffness).configure()
-            cfg = self.stability.configure(H1EnvConfig(backend="mjbatch", num_threads=self.threads))
+            cfg = self.stability.configure(HumanoidEnvConfig(backend="mjbatch", num_threads=self.threads))
             cfg.upper_body = arms
             rows[name] = {
                 "softer_over_stiffer": soft / stiff,
                 "wrong_over_right_displacement": wrong / right,
                 "wrong_model_shift": float((misled - at).norm()),
                 "linearised": growth_rates(h1(), arms.built(arms.left), self.stability),
-                "energy": energy_summary(exchanged_energy(H1Env(cfg), self.stability)),
+                "energy": energy_summary(exchanged_energy(HumanoidEnv(cfg), self.stability)),
             }
             print(f"  {name}", file=sys.stderr)
         return {"rows": rows}
@@ -314,18 +312,19 @@ class Properties:
 
         Pelvis fixed; the stiffness of the hand without a load is the last.
         """
-        protocol = StaticStiffness(force=(0.0, 0.0, -self.load), levels=1 + len(stiffness))
-        cfg = protocol.configure(H1EnvConfig(backend="mjbatch", num_threads=self.threads))
-        cfg.force.start_s = self.settle_seconds
+        protocol = StaticStiffness(num_envs=1 + len(stiffness), levels=2, settle_seconds=self.settle_seconds)
+        cfg = protocol.configure(HumanoidEnvConfig(backend="mjbatch", num_threads=self.threads))
         cfg.upper_body = laws_of(name, stiffness[-1]).configure()
-        env = H1Env(cfg)
+        env = HumanoidEnv(cfg)
         if wrong:
             misjudge(env, self.wrong_length, self.wrong_mass)
         env.upper_body.parameters.stiffness[:-1] = torch.tensor(stiffness)[:, None, None]
-        env.scripted.amplitude_h[-1] = 0.0
-        env.motions.hold(mirrored_pose(env, protocol.arm_pose))
-        moved = settle(env, None, self.settle_seconds, 0, False).moved[:-1, 2]
-        return (-moved).tolist(), env.state.arms.tip[-1, 0].clone()
+        protocol.prepare(env)
+        force = torch.zeros(env.num_envs, 3)
+        force[:-1, 2] = -self.load
+        side = protocol.load(env, force)
+        moved = settle(env, idle(env), self.settle_seconds, side).moved[:-1, 2]
+        return (-moved).tolist(), env.state.arms.tip[-1, side].clone()
 
     def table(self, result: dict[str, Any]) -> str:
         """As Markdown: Table I in figures, and what the stability column sums up."""

@@ -58,7 +58,7 @@ def walking(runs: Runs, envs: int, seconds: float) -> list[str]:
     easier = runs("walking-base-feet", *task, "--collision", "feet", checkpoint=runs.base)
     lines = [
         "## Walking", "",
-        f"Random commands, clips on the arms, randomisation on, {envs} worlds, {seconds:g} s, legs, arms and torso "
+        f"Random commands, clips on the arms, randomisation on, {envs} envs, {seconds:g} s, legs, arms and torso "
         "that collide, but for the base's second row, in which feet pass through each other. In bold: "
         "worse than the base in the same simulation by more than 10 % and beyond its 95 % interval.", "",
         "| K_ee [N/m] | alpha | " + " | ".join(WALKING.values()) + " | fell |",
@@ -92,7 +92,7 @@ def obedience(runs: Runs, envs: int) -> list[str]:
     """One policy, no retraining: torque under an impact and displacement under a load, against stiffness."""
     lines = [
         "## One policy, every stiffness", "",
-        f"Left hand, stance, arms' default pose, {envs} worlds, alpha 1. Impact: 500 N x 0.05 s along x. "
+        f"Left hand, stance, arms' default pose, {envs} envs, alpha 1. Impact: 500 N x 0.05 s along x. "
         "Load: -15 N in z, displacement of the hand relative to its reference.", "",
         "| K_ee [N/m] | J_upper under the impact [Nm] | fell | displacement under the load [m] | F / K [m] | fell |",
         "|---|---|---|---|---|---|",
@@ -100,13 +100,13 @@ def obedience(runs: Runs, envs: int) -> list[str]:
     torques, drops = [], []
     for stiffness in STIFFNESS:
         law = ["--method", "cotap", "--stiffness", str(stiffness), "--num-envs", str(envs)]
-        blow = runs(f"impact-{stiffness}", "impact", *law)
+        push = runs(f"impact-{stiffness}", "impact", "--motion", "none", *law)
         load = runs(f"load-{stiffness}", "constant-load", "--force", "0", "0", "-15", *law)
-        torque, drop = blow["metrics"]["j_upper"], load["metrics"]["displacement_z"]
+        torque, drop = push["metrics"]["j_upper"], load["metrics"]["displacement_z"]
         torques.append(torque)
         drops.append(drop)
         lines.append(
-            f"| {stiffness} | {number(torque, 1)} | {blow['num_falls']} of {envs} | {number(drop, 4)} "
+            f"| {stiffness} | {number(torque, 1)} | {push['num_falls']} of {envs} | {number(drop, 4)} "
             f"| {-15.0 / stiffness:.4f} | {load['num_falls']} of {envs} |"
         )
     rising = all(a["ci95"][1] < b["ci95"][0] for a, b in itertools.pairwise(torques))
@@ -124,7 +124,7 @@ def against_pd(runs: Runs, envs: int) -> list[str]:
 
     lines = [
         "## Against PD", "",
-        f"Impact of 500 N x 0.05 s on the left hand, the same policy and {envs} worlds, arms' default pose.", "",
+        f"Impact of 500 N x 0.05 s on the left hand, the same policy and {envs} envs, arms' default pose.", "",
         "| mode | arms | e_torso [m/s] | e_ee [m] | J_upper [Nm] | fell |", "|---|---|---|---|---|---|",
     ]  # fmt: skip
     rows = {"PD": ["--method", "pd"]} | {
@@ -139,7 +139,7 @@ def against_pd(runs: Runs, envs: int) -> list[str]:
         pd = None
         for name, law in rows.items():
             size = ["--num-envs", str(envs), "--worlds"]
-            result = runs(f"pd-{mode}-{name.replace(' ', '')}", "impact", *size, *where, *law)
+            result = runs(f"pd-{mode}-{name.replace(' ', '')}", "impact", "--motion", "none", *size, *where, *law)
             pd, m = pd or result, result["metrics_without_falls"]
             names = ("e_torso", "e_ee", "j_upper")
             figures = [m[key] for key in names]
@@ -151,7 +151,7 @@ def against_pd(runs: Runs, envs: int) -> list[str]:
     return [
         *lines,
         "",
-        "Better than PD in all three, the 95 % intervals of the differences, world by world, below zero: "
+        "Better than PD in all three, the 95 % intervals of the differences, env by env, below zero: "
         f"{'; '.join(wins) or 'none'}.",
         "",
     ]
@@ -161,7 +161,7 @@ def changing(runs: Runs, envs: int) -> list[str]:
     """Stiffness and blend changed over their whole range."""
     lines = [
         "## Stiffness that changes", "",
-        f"Stiffness and alpha stepped and ramped over their whole range, {envs} worlds.", "",
+        f"Stiffness and alpha stepped and ramped over their whole range, {envs} envs.", "",
         "| case | fell | peak arm torque [Nm] | energy [J] |", "|---|---|---|---|",
     ]  # fmt: skip
     loads = {"": [], ", 15 N down on the left hand": ["--force", "0", "0", "-15"]}
@@ -182,8 +182,8 @@ def changing(runs: Runs, envs: int) -> list[str]:
 def main() -> int:
     """Measure and write. Exit status."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--checkpoint", default="cotap", help="the distilled policy")
-    parser.add_argument("--base", default="base", help="the base that it is compared with")
+    parser.add_argument("--checkpoint", default="h1-cotap", help="the distilled policy")
+    parser.add_argument("--base", default="h1-base", help="the base that it is compared with")
     parser.add_argument("--num-envs", type=int, default=1024)
     parser.add_argument("--obedience-envs", type=int, default=4096)
     parser.add_argument("--walking-envs", type=int, default=1024)

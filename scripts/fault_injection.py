@@ -1,5 +1,5 @@
 """Injects faults into small trainings and shows what survives: kills at random moments, disks that fill or turn
-read-only, clocks that jump, worlds that diverge, steps that raise. Prints a table; POSIX only.
+read-only, clocks that jump, envs that diverge, steps that raise. Prints a table; POSIX only.
 
 Every training is a forked process that runs the training command itself. One run that nothing happens to is what all
 others must end equal to, bit for bit.
@@ -33,12 +33,13 @@ from cotap import train
 from cotap.agents.checkpoint import load_checkpoint
 from cotap.agents.dual_ppo import DualPPO
 from cotap.agents.runner import CHECKPOINT_PATTERN
-from cotap.envs import H1Env
+from cotap.envs import HumanoidEnv
+from cotap.envs.external_forces import ExternalForces
 
-ITERATIONS, INTERVAL, STEPS, WORLDS, SICK = 12, 2, 4, 16, 3
-"""Of every training: iterations, iterations between saves, steps per iteration, worlds, and the world that is hurt."""
+ITERATIONS, INTERVAL, STEPS, ENVS, SICK = 12, 2, 4, 16, 3
+"""Of every training: iterations, iterations between saves, steps per iteration, envs, and the env that is hurt."""
 OPTIONS = [
-    "base", "--num-envs", WORLDS, "--iterations", ITERATIONS, "--threads", 1, "--ppo.hidden", 8, 8, "--ppo.steps",
+    "base", "--num-envs", ENVS, "--iterations", ITERATIONS, "--threads", 1, "--ppo.hidden", 8, 8, "--ppo.steps",
     STEPS, "--ppo.precision", "fp32", "--runner.save-interval", INTERVAL,
 ]  # fmt: skip
 Prepare = Callable[[], None]
@@ -143,7 +144,7 @@ def equal(a: Any, b: Any) -> bool:
 
 
 def same_end(folder: Path, reference: Path) -> bool:
-    """Whether a run ended as the one that nothing happened to: networks, optimisers, worlds, random numbers."""
+    """Whether a run ended as the one that nothing happened to: networks, optimisers, envs, random numbers."""
     parts = ("model", "learner", "env", "iteration", "samples", "rng")
     one, other = (load_checkpoint(f / f"checkpoint_{ITERATIONS:06d}.pt") for f in (folder, reference))
     return all(equal(one[p], other[p]) for p in parts)
@@ -159,7 +160,7 @@ def curve(folder: Path, tag: str) -> list[tuple[int, float]]:
 def one_curve(folder: Path) -> bool:
     """Whether the log has every iteration once, in order."""
     steps = [step for step, _ in curve(folder, "throughput/steps_per_s")]
-    return steps == [STEPS * WORLDS * (i + 1) for i in range(ITERATIONS)]
+    return steps == [STEPS * ENVS * (i + 1) for i in range(ITERATIONS)]
 
 
 def kill_runs(work: Path, reference: Path, kills: int, pace: tuple[float, float], rng: random.Random) -> list[Row]:
@@ -241,52 +242,49 @@ def _killed_at_rename(folder: Path, number: int) -> Prepare:
     return lambda: sys.addaudithook(hook)
 
 
-def at_step(number: int, act: Callable[[H1Env], None], before: bool = True) -> Prepare:
-    """Do something to the environment at one of its steps, before or after it."""
+def at_step(number: int, act: Callable[[HumanoidEnv], None]) -> Prepare:
+    """Do something to the environment before one of its steps."""
 
     def prepare() -> None:
-        step, count = H1Env.step, 0
+        step, count = HumanoidEnv.step, 0
 
-        def hurt(env: H1Env, actions: torch.Tensor) -> Any:
+        def hurt(env: HumanoidEnv, actions: torch.Tensor) -> Any:
             nonlocal count
             count += 1
-            if count == number and before:
+            if count == number:
                 act(env)
-            result = step(env, actions)
-            if count == number and not before:
-                act(env)
-            return result
+            return step(env, actions)
 
-        H1Env.step = hurt
+        HumanoidEnv.step = hurt
 
     return prepare
 
 
 def diverge(work: Path) -> list[Row]:
-    """A position that is not a number, and a force beyond all measure, in one world."""
+    """A position that is not a number, and a force beyond all measure, in one env."""
 
-    def nan(env: H1Env) -> None:
+    def nan(env: HumanoidEnv) -> None:
         env.sim.qpos[SICK, 10] = math.nan
 
     def push() -> None:
-        forces, count = H1Env._apply_forces, 0
+        apply, count = ExternalForces.apply, 0
 
-        def pushed(env: H1Env) -> None:
+        def pushed(forces: ExternalForces, xfrc: torch.Tensor, *args: Any) -> None:
             nonlocal count
-            forces(env)
+            apply(forces, xfrc, *args)
             count += 1
             if count == 9:
-                env.sim.xfrc[SICK, 1, 2] = 1e12
+                xfrc[SICK, 1, 2] = 1e12
 
-        H1Env._apply_forces = pushed
+        ExternalForces.apply = pushed
 
     rows = []
-    for name, prepare in (("NaN in a world's state", at_step(9, nan)), ("force of 1e12 N on a world", push)):
+    for name, prepare in (("NaN in an env's state", at_step(9, nan)), ("force of 1e12 N on an env", push)):
         folder = work / f"diverged{len(rows)}"
         run = Run(folder, prepare)
-        ok = run.wait() == 0 and "worlds diverged 1 times" in run.log.read_text()
+        ok = run.wait() == 0 and "envs diverged 1 times" in run.log.read_text()
         ok = ok and curve(folder, "episode/diverged")[-1][1] == 1.0 and _all_finite(load_checkpoint(newest(folder)))
-        rows.append(Row(name, 1, int(ok), 0, "the world's episode ends, named and counted once; all else finite"))
+        rows.append(Row(name, 1, int(ok), 0, "the env's episode ends, named and counted once; all else finite"))
     return rows
 
 
@@ -294,17 +292,17 @@ def bad_reward(work: Path) -> Row:
     """A reward that is not a number."""
 
     def prepare() -> None:
-        reward, count = H1Env._reward, 0
+        step, count = HumanoidEnv.step, 0
 
-        def spoiled(env: H1Env, *args: Any) -> Any:
+        def spoiled(env: HumanoidEnv, actions: torch.Tensor) -> Any:
             nonlocal count
-            rewards, log = reward(env, *args)
+            result = step(env, actions)
             count += 1
             if count == 9:
-                rewards[SICK, 0] = math.nan
-            return rewards, log
+                result[3]["group_rewards"][SICK, 0] = math.nan
+            return result
 
-        H1Env._reward = spoiled
+        HumanoidEnv.step = spoiled
 
     run = Run(work / "reward", prepare)
     ok = run.wait() == 0 and "steps of agent 'lower' skipped" in run.log.read_text()
@@ -322,7 +320,7 @@ def _all_finite(value: Any) -> bool:
 def raising_step(work: Path, reference: Path) -> Row:
     """A step that raises, as when a worker dies."""
 
-    def fail(_env: H1Env) -> None:
+    def fail(_env: HumanoidEnv) -> None:
         raise RuntimeError("planted: a worker died")
 
     folder = work / "raised"
@@ -383,12 +381,12 @@ def full_disk(work: Path, reference: Path) -> list[Row]:
 def _on_disk(disk: Path, work: Path, reference: Path) -> list[Row]:
     ballast = disk / "ballast"
 
-    def fill(_env: H1Env) -> None:
+    def fill(_env: HumanoidEnv) -> None:
         with contextlib.suppress(OSError), ballast.open("wb", buffering=0) as file:
             while True:
                 file.write(bytes(4096))
 
-    def free(_env: H1Env) -> None:
+    def free(_env: HumanoidEnv) -> None:
         ballast.unlink()
 
     folder = disk / "while"
@@ -501,7 +499,7 @@ def main() -> int:
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="cotap-faults-") as work:
         rows = inject(options.kills, Path(work), options.seed)
-    print(f"{WORLDS} worlds, {ITERATIONS} iterations, a save every {INTERVAL}\n\n{table(rows)}")
+    print(f"{ENVS} envs, {ITERATIONS} iterations, a save every {INTERVAL}\n\n{table(rows)}")
     if options.json:
         options.json.write_text(json.dumps([asdict(r) for r in rows], indent=2) + "\n")
     return int(any(r.survived < r.injected for r in rows))

@@ -33,7 +33,7 @@ def draw_static(result: dict[str, Any]) -> Any:
 
 
 def draw_transient(result: dict[str, Any], until_s: float = 1.5) -> Any:
-    """Displacement of the struck hand over time, mean and standard deviation over worlds: a panel per law and force."""
+    """Displacement of the struck hand over time, mean and standard deviation over envs: a panel per law and force."""
     plt = _pyplot()
     forces = result["forces"]
     columns = max(len(rows) for rows in forces.values())
@@ -57,7 +57,7 @@ def draw_transient(result: dict[str, Any], until_s: float = 1.5) -> Any:
             axis.grid(alpha=0.2)
         line[0].set_ylabel("displacement along x [m]", fontsize=8)
     for axis in axes[-1]:
-        axis.set_xlabel("time since the blow [s]", fontsize=8)
+        axis.set_xlabel("time since the push [s]", fontsize=8)
     return figure
 
 

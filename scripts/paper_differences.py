@@ -13,27 +13,25 @@ AIM = """Asked of K_ee 500 in stance, under H1's limits and in a window of 1 s: 
 of at most 0.10 m. Measured: {torso} m/s and {hand} m; with ten times the torque limits {free_torso} m/s and
 {free_hand} m."""
 
-TORSO = """In stance the paper's torso is thrown further at K 100 (0.861 m/s) than under PD (0.701) and less far under
+TORSO = """In stance the paper's torso moves further at K 100 (0.861 m/s) than under PD (0.701) and less far under
 soft PD (0.670). Ours at K 100 less ours under PD: {pd} m/s; under soft PD less K 100: {soft} m/s. Arms under CoTaP are
-critically damped here and come to rest after the blow, under PD's damping they swing
-([distillation](distillation.md#against-pd) has K 300, alpha 0.5 with both). In walking the paper's errors are 2.1 m/s.
-A blow of {impulse:g} N s changes the velocity of {mass:.0f} kg by {velocity:.2f} m/s, so errors of that size, averaged
-over any window, are not the blow's alone. Robots that fall, or do not walk as commanded, would explain them; ours that
-fell are left out and have their own column."""
+critically damped here and come to rest after the push, under PD's damping they swing. In walking the paper's errors are
+2.1 m/s. A push of {impulse:g} N s changes the velocity of {mass:.0f} kg by {velocity:.2f} m/s, so errors of that size,
+averaged over any window, are not the push's alone. Robots that fall, or do not walk as commanded, would explain them;
+ours that fell are left out and have their own column."""
 
 TORQUE = """J_upper is a 2-norm of eight torques, averaged over a window that the paper does not give, under limits that
 it does not give. Ours of the first 0.1 s under H1's limits beside the paper's, in stance: {early}. That may be its
-window, but for PD and soft PD; over 1 s there is also what arms do once the blow is over, and J_upper without any blow
+window, but for PD and soft PD; over 1 s there is also what arms do once the push is over, and J_upper without any push
 is {calm} Nm."""
 
 BLENDS = """From K 100 over alpha 0.7 and 0.3 to PD the paper's J_upper rises by about 1 Nm a step. Ours in stance, over
 1 s: {second} Nm; over the first 0.1 s: {early} Nm; over 1 s with ten times the torque limits: {free} Nm. So what a
-blend changes is the answer to the blow itself; over a second the three blends, which carry the arms' weight and damp
+blend changes is the answer to the push itself; over a second the three blends, which carry the arms' weight and damp
 critically alike, differ by next to nothing, and PD, which does neither, stands apart."""
 
-FALLS = """The paper gives no share of falls. Of ours {fell} fall in stance at K 100 when the blow finds the arms
-moving; at the arms' default pose none of the standing ones does from this blow
-([distillation](distillation.md#against-pd))."""
+FALLS = """The paper gives no share of falls. Of ours {fell} fall in stance at K 100 when the push finds the arms
+moving."""
 
 LOADS = """Under PD the paper's hand error reverses after its peak (-0.03 m). A hand at rest lies on the load's side
 ({pd} m here), so that is motion, or the policy's own arm actions, which the paper names and which ours learns to leave
@@ -43,14 +41,12 @@ error is exact for small displacements only, see [compliance](compliance.md)) an
 which the arm cannot reach: near its end the ratio gives way to PD."""
 
 TRAINING = """The paper's base could not be controlled under compliance, and with the raw reference as target it
-followed half as well as CoTaP (0.252 and 0.107 rad). Our base stands and walks under it, and falls from the blow more
-often: {base_fell} against {cotap_fell}. Its e_upper less CoTaP's is {blow} rad with the blow and {calm} without. But it
-goes on from a CoTaP policy, under PD, and so has met compliance before; what a base does that never had is in
-[training](training.md#what-is-known-to-be-wrong). How faithful its stiffness is, with its own arm actions and without,
-is under [fidelity](#fidelity)."""
+followed half as well as CoTaP (0.252 and 0.107 rad). Of ours {base_fell} fall from the push, of CoTaP's {cotap_fell}.
+Its e_upper less CoTaP's is {push} rad with the push and {calm} without. How faithful its stiffness is, with its own arm
+actions and without, is under [fidelity](#fidelity)."""
 
 SINGULAR = """Without the ratio arms do not keep stretched postures, as in the paper. Here the law does that by itself:
-CoTaP's own policy leaves them as far once the ratio is left out of its law. With arms that move and no blow, e_upper is
+CoTaP's own policy leaves them as far once the ratio is left out of its law. With arms that move and no push, e_upper is
 {law} rad then, {trained} rad for the policy that went on learning without, {ratio} rad with the ratio;
 [stretched arms](#singular-postures-the-papers-fig-6) that were struck stay {struck} rad from their reference, {kept}
 rad with the ratio. Next to a singularity the law leaves a joint almost without stiffness. What longer training without
@@ -61,8 +57,7 @@ arm is at rest at every moment, and gravity less J^T F holds it whatever its sti
 agree. Much less torque needs another pose or another load."""
 
 OBSERVATION = """Without arm torque in the actor's observation e_torso changes by {change} m/s, x by {x}, y by {y}. The
-paper's Fig. 8 shows more. Our ablation is CoTaP's own policy, refitted to what it sees and trained a little longer,
-instead of a training from nothing."""
+paper's Fig. 8 shows more. Our ablation is distilled from the same base, refitted to what it sees."""
 
 
 def differences(book: Book) -> None:
@@ -84,7 +79,7 @@ def differences(book: Book) -> None:
 
 
 def of(book: Book, name: str, measure: str, digits: int = 3) -> str:
-    """The mean of a measure over the worlds that stood."""
+    """The mean of a measure over the envs that stood."""
     result = book.results.get(name)
     mean = result["metrics_without_falls"].get(measure, {}).get("mean") if result else None
     return "(not measured)" if mean is None else f"{mean:.{digits}f}"
@@ -96,7 +91,7 @@ def fell(book: Book, name: str) -> str:
 
 
 def change(book: Book, first: str, second: str, measure: str, digits: int = 3) -> str:
-    """The second row less the first with the interval, taken world by world."""
+    """The second row less the first with the interval, taken env by env."""
     d = compared(book, first, second, measure)
     if d["difference"] is None:
         return f"({d['reason']})"
@@ -115,7 +110,7 @@ def aim(book: Book) -> dict[str, str]:
 
 
 def torso(book: Book) -> dict[str, str | float]:
-    """The order of PD, soft PD and compliance, and what a blow can do to a robot's velocity."""
+    """The order of PD, soft PD and compliance, and what a push can do to a robot's velocity."""
     from cotap.robots import ROBOTS
 
     mass = sum(body.mass_kg for body in ROBOTS["h1"]().bodies)
@@ -130,7 +125,7 @@ def torso(book: Book) -> dict[str, str | float]:
 
 
 def torque(book: Book) -> dict[str, str]:
-    """J_upper of the blow itself beside the paper's, row by row."""
+    """J_upper of the push itself beside the paper's, row by row."""
     pairs = zip(ROWS, IMPACT["stance"], strict=True)
     early = ", ".join(
         f"{row} {of(book, f'impact-stance-cotap-{slug(row)}', 'j_upper_blow', 1)} Nm ({paper[2]:.1f})"
@@ -166,7 +161,7 @@ def training(book: Book) -> dict[str, str]:
     return {
         "base_fell": fell(book, "ablation-no-training"),
         "cotap_fell": fell(book, "ablation-CoTaP"),
-        "blow": change(book, "ablation-CoTaP", "ablation-no-training", "e_upper"),
+        "push": change(book, "ablation-CoTaP", "ablation-no-training", "e_upper"),
         "calm": change(book, "calm-CoTaP", "calm-no-training", "e_upper"),
     }
 
@@ -186,5 +181,5 @@ def singular(book: Book) -> dict[str, str]:
 def observation(book: Book) -> dict[str, str]:
     """What torque in the actor's observation is worth."""
     names = {"change": "e_torso", "x": "e_torso_x", "y": "e_torso_y"}
-    rows = ("observation-cotap", "observation-cotap-torque-critic")
+    rows = ("observation-cotap", "observation-torque-critic")
     return {key: change(book, *rows, measure) for key, measure in names.items()}

@@ -8,8 +8,10 @@ from typing import Any
 
 from kept_evaluations import kept_or_run
 
+SHIPPED = {"cotap": "h1-cotap", "base": "h1-base"}
+"""Policies that come with the package; those of ablations are given by `--policies`."""
 PAIRED = ("impact", "constant-load")
-"""Protocols that write every world's figures, so that two evaluations are compared world by world."""
+"""Protocols that write every env's figures, so that two evaluations are compared env by env."""
 
 
 @dataclass
@@ -21,21 +23,28 @@ class Book:
     envs: int
     threads: int
     reuse: bool
+    policies: dict[str, str] = field(default_factory=lambda: dict(SHIPPED))
+    """Checkpoint of each policy, a file or the name of a shipped one."""
     lines: list[str] = field(default_factory=list)
     results: dict[str, dict[str, Any]] = field(default_factory=dict)
     differences: dict[str, dict[str, Any]] = field(default_factory=dict)
 
-    def run(self, name: str, checkpoint: str, *args: str, envs: int | None = None) -> dict[str, Any] | None:
-        """An evaluation's result under `name`; None where its checkpoint is not shipped."""
-        from cotap.evaluation.policy import shipped_names
+    def has(self, policy: str) -> bool:
+        """Whether there is a checkpoint of this policy."""
+        from cotap.evaluation.policy import CHECKPOINTS, shipped_names
 
-        if checkpoint not in shipped_names():
+        given = self.policies.get(policy, "")
+        return given in shipped_names() if given in CHECKPOINTS else Path(given).is_file()
+
+    def run(self, name: str, policy: str, *args: str, envs: int | None = None) -> dict[str, Any] | None:
+        """An evaluation's result under `name`; None where there is no checkpoint of its policy."""
+        if not self.has(policy):
             return None
         size = [] if envs == 0 else ["--num-envs", str(envs or self.envs)]
         paired = ["--worlds"] if args[0] in PAIRED else []
         path = self.evaluations / f"{name}.json"
         arguments = [args[0], *size, *paired, *args[1:]]
-        self.results[name] = kept_or_run(path, arguments, checkpoint, self.threads, self.reuse)
+        self.results[name] = kept_or_run(path, arguments, self.policies[policy], self.threads, self.reuse)
         return self.results[name]
 
     def add(self, *lines: str) -> None:
@@ -59,21 +68,21 @@ def number(m: dict[str, Any] | None, digits: int = 3) -> str:
 
 
 def fallen(result: dict[str, Any]) -> str:
-    """Share of worlds that fell until the end of the episode, not in the window alone, with Wilson's interval."""
+    """Share of envs that fell until the end of the episode, not in the window alone, with Wilson's interval."""
     from cotap.evaluation.metrics import wilson_interval
 
-    share, worlds = result["num_falls"] / result["num_envs"], result["num_envs"]
-    low, high = (100.0 * bound for bound in wilson_interval(share, worlds))
+    share, envs = result["num_falls"] / result["num_envs"], result["num_envs"]
+    low, high = (100.0 * bound for bound in wilson_interval(share, envs))
     return f"{100.0 * share:.1f} % ({low:.1f} to {high:.1f})"
 
 
-def missing(checkpoint: str) -> str:
-    """What stands where a checkpoint would be measured that is not shipped."""
-    return f"checkpoint `{checkpoint}` is not shipped with this release: not measured"
+def missing(policy: str) -> str:
+    """What stands where a policy would be measured of which there is no checkpoint."""
+    return f"no checkpoint of `{policy}`: not measured"
 
 
 def compared(book: Book, first: str, second: str, measure: str) -> dict[str, Any]:
-    """The second row less the first, over the worlds that stood in both; `difference` is null where there is none."""
+    """The second row less the first, over the envs that stood in both; `difference` is null where there is none."""
     from cotap.compare import measure_difference
 
     if not {first, second} <= book.results.keys():
@@ -89,7 +98,7 @@ def verdict(book: Book, smaller: str, larger: str, measure: str, digits: int = 3
     if d["difference"] is None:
         return f"not measured ({d['reason']})"
     low, high = d["ci95"]
-    word = "holds" if low > 0.0 else "does not hold" if high < 0.0 else "cannot be told apart"
+    word = "holds" if low > 0.0 else "does not hold" if high < 0.0 else "cannot be distinguished"
     return f"**{word}**, difference {d['difference']:+.{digits}f} ({low:+.{digits}f} to {high:+.{digits}f})"
 
 

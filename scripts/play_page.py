@@ -225,7 +225,8 @@ class Film:
         port = free_port()
         server = open_server("127.0.0.1", port)
         with tempfile.TemporaryDirectory() as folder:
-            session = Session({"cotap": default_checkpoint()}, self.seed)
+            policy = default_checkpoint()
+            session = Session({policy.stem: policy}, self.seed)
             app = App(server, Scene(server, session.env.spec, len(ROBOTS)), session, Path(folder))
             server.initial_camera.position, server.initial_camera.look_at = (2.1, 1.4, 1.4), (0.0, 0.5, 0.85)
             thread = threading.Thread(target=app.run, daemon=True)

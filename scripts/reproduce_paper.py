@@ -1,19 +1,18 @@
 """Every table and figure of the paper from the shipped checkpoints, as Markdown, JSON and PNG, beside the paper's own.
 
-`--quick` takes fewer worlds and writes to runs/paper-quick, `--only` takes parts and writes to runs/paper; without
+`--quick` takes fewer envs and writes to runs/paper-quick, `--only` takes parts and writes to runs/paper; without
 them, docs/results.md and docs/results/ are written.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from pathlib import Path
 from typing import Any
 
 from paper_differences import differences
-from paper_page import Book, fallen, missing, number, ordering, picture, plot_curves, slug, verdict, write
+from paper_page import SHIPPED, Book, fallen, missing, number, ordering, picture, plot_curves, slug, verdict, write
 from paper_tables import ABLATION, IMPACT, LOAD, ROWS
 
 from cotap.graphics import choose_opengl
@@ -36,7 +35,7 @@ PUNCHED = 512
 """Worlds in the minute of punches, ten times as long as anything else here."""
 SCALED = 10.0
 """Factor on the torque limits at which an impact saturates nothing."""
-STRAIGHT = ["--arm-pose", "-1.5", "0.3", "0", "1.35"]
+STRAIGHT = ["--motion", "none", "--arm-pose", "-1.5", "0.3", "0", "1.35"]
 """Both arms stretched forward, all but straight: a condition number of 26."""
 BACK = ["--force", "-500", "0", "0"]
 CALM = ["--force", "0", "0", "0"]
@@ -138,7 +137,7 @@ def constant_loads(book: Book) -> None:
             curves = {
                 name: (r["curve"]["time"], r["curve"].get("hand_displacement_z", [])) for name, r in found.items()
             }
-            caption = f"Left hand's displacement in z under -50 N, policy {policy}; means over worlds that stood."
+            caption = f"Left hand's displacement in z under -50 N, policy {policy}; means over envs that stood."
             plot_curves(
                 book.figure(f"constant_load_{policy}", caption),
                 curves,
@@ -148,12 +147,12 @@ def constant_loads(book: Book) -> None:
         book.add("")
 
 
-def samples(checkpoint: str) -> int:
-    """What a shipped policy was trained on; 0 for one that is not shipped."""
-    from cotap.evaluation.policy import checkpoint_path
+def samples(book: Book, policy: str) -> int:
+    """What a policy was trained on; 0 for one of which there is no checkpoint."""
+    from cotap.agents.checkpoint import load_checkpoint
+    from cotap.evaluation.policy import find_checkpoint
 
-    path = checkpoint_path(checkpoint).with_suffix(".json")
-    return json.loads(path.read_text())["samples"] if path.is_file() else 0
+    return load_checkpoint(find_checkpoint(book.policies[policy]))["samples"] if book.has(policy) else 0
 
 
 def ablations(book: Book, motion: str, quick: bool) -> None:
@@ -163,19 +162,19 @@ def ablations(book: Book, motion: str, quick: bool) -> None:
         "",
         "## Ablation (the paper's Table IV)",
         "",
-        f"Impact of 500 N in stance at K_ee 100, {envs} worlds a row. *No training*: the base's legs, raw reference as "
-        "arm target; that base has met compliance before, since it goes on from a CoTaP policy.",
+        f"Impact of 500 N in stance at K_ee 100, {envs} envs a row. *No training*: the base's legs, raw reference as "
+        "arm target.",
         "",
-        "| what | e_torso [m/s] | e_upper [rad] | the same without the blow [rad] | fell | paper: e_torso / e_upper |",
+        "| what | e_torso [m/s] | e_upper [rad] | the same without the push [rad] | fell | paper: e_torso / e_upper |",
         "|---|---|---|---|---|---|",
     )
     rows = {
-        "no training": ("base", ["--no-arm-actions"]),
+        "no training": ("base", ["--upper-actions", "reference"]),
         "no training, base policy's own arm actions": ("base", []),
-        "without the ratio": ("cotap-no-ratio", ["--no-singularity-ratio"]),
+        "without the ratio": ("no-ratio", ["--no-singularity-ratio"]),
         "CoTaP's policy, the ratio left out of the law alone": ("cotap", ["--no-singularity-ratio"]),
-        "arm torque in the critic's observation": ("cotap-torque-critic", []),
-        "goals in the observation": ("cotap-goals", []),
+        "arm torque in the critic's observation": ("torque-critic", []),
+        "goals in the observation": ("goals", []),
         "CoTaP": ("cotap", []),
     }
     for name, (checkpoint, args) in rows.items():
@@ -191,17 +190,16 @@ def ablations(book: Book, motion: str, quick: bool) -> None:
             f"| {name} | {number(m['e_torso'])} | {number(m['e_upper'])} | {number(quiet['e_upper'])} "
             f"| {fallen(result)} | {printed} |"
         )
-    trained = [(name, samples(name)) for name in ("cotap", "cotap-no-ratio", "cotap-torque-critic", "cotap-goals")]
+    trained = [(name, samples(book, name)) for name in ("cotap", "no-ratio", "torque-critic", "goals")]
     behind = ", ".join(f"`{name}` {n / 1e6:.1f} M" for name, n in trained if n)
     book.add(
         "",
-        "One seed each. The three that were trained under their change go on from CoTaP's own networks. "
-        f"Samples behind each: {behind}.",
+        f"One seed each, distilled from the same base. Samples behind each: {behind or 'none measured'}.",
         "",
     )
     for other, row in (("without the ratio", "without-the-ratio"), ("without training", "no-training")):
-        for blow, kind in (("", "ablation"), (", without the blow", "calm")):
-            claim = f"e_upper of CoTaP below that {other}{blow}"
+        for push, kind in (("", "ablation"), (", without the push", "calm")):
+            claim = f"e_upper of CoTaP below that {other}{push}"
             ordering(book, claim, f"{kind}-CoTaP", f"{kind}-{row}", "e_upper")
 
 
@@ -260,7 +258,7 @@ def torque_observation(book: Book) -> None:
     curves = {}
     for label, checkpoint in (
         ("torque in actor's observation", "cotap"),
-        ("torque in critic's", "cotap-torque-critic"),
+        ("torque in critic's", "torque-critic"),
     ):
         result = book.run(
             f"observation-{checkpoint}",
@@ -298,10 +296,10 @@ def torque_observation(book: Book) -> None:
     book.add("")
     for measure, what in (("e_torso_x", "Error in x"), ("e_torso_y", "Error in y"), ("e_torso", "e_torso")):
         claim = f"{what} with torque in the actor's observation below that without"
-        ordering(book, claim, "observation-cotap", "observation-cotap-torque-critic", measure, 4)
+        ordering(book, claim, "observation-cotap", "observation-torque-critic", measure, 4)
     if curves:
         plot_curves(
-            book.figure("torque_observation", "Absolute velocity error from the first step on, mean over worlds."),
+            book.figure("torque_observation", "Absolute velocity error from the first step on, mean over envs."),
             curves,
             "time since the window began, 1 s after the start [s]",
             "absolute velocity error [m/s]",
@@ -327,12 +325,12 @@ def fidelity(book: Book, quick: bool) -> None:
         "|---|---|---|---|---|---|---|---|---|",
     )
     rows = [(policy, policy, []) for policy in POLICIES]
-    rows.append((f"{POLICIES[-1]}, without its arm actions", POLICIES[-1], ["--no-arm-actions"]))
-    poses = ["--poses", "4" if quick else "32"]
+    rows.append((f"{POLICIES[-1]}, without its arm actions", POLICIES[-1], ["--upper-actions", "reference"]))
+    size = 48 if quick else 384
     for label, policy, args in rows:
         for error in ("joint", "task"):
             name = f"fidelity-{slug(label)}-{error}"
-            result = book.run(name, policy, "fidelity", "--error", error, *poses, *args, envs=0)
+            result = book.run(name, policy, "fidelity", "--error", error, *args, envs=size)
             if result is None:
                 book.add(f"| {label} | {error} | {missing(policy)} | | | | | | |")
                 continue
@@ -392,7 +390,7 @@ def robustness(book: Book, quick: bool) -> None:
                 walk = result["settings"]
                 book.add(
                     f"| punches up to 600 N, {walk['waypoints']} waypoints in {walk['episode_seconds']:g} s, "
-                    f"completed ({result['num_envs']} worlds) | {policy} "
+                    f"completed ({result['num_envs']} envs) | {policy} "
                     f"| {label} | {number(result['metrics']['completed_fraction'], 2)} |"
                 )
             result = book.run(
@@ -448,7 +446,7 @@ def robustness(book: Book, quick: bool) -> None:
                 )
     if curves:
         draw_fall_curves(
-            book.figure("fall_curve", "Share of worlds that fall within 3 s of a blow on the left hand."), curves
+            book.figure("fall_curve", "Share of envs that fall within 3 s of a push on the left hand."), curves
         )
 
 
@@ -465,7 +463,7 @@ def draw_fall_curves(path: Path, results: dict[str, dict[str, Any]]) -> None:
     figure, axis = plt.subplots(figsize=(7.0, 4.2), constrained_layout=True)
     for (label, result), color in zip(results.items(), ("#cb181d", "#2171b5", "#fb6a4a", "#6baed6"), strict=False):
         draw_fall_curve(axis, result, color, label)
-    axis.set(xlabel="impulse [N s]", ylabel="share of worlds that fell", ylim=(-0.02, 1.02))
+    axis.set(xlabel="impulse [N s]", ylabel="share of envs that fell", ylim=(-0.02, 1.02))
     axis.grid(alpha=0.2)
     axis.legend(frameon=False)
     save_figure(figure, path)
@@ -473,11 +471,13 @@ def draw_fall_curves(path: Path, results: dict[str, dict[str, Any]]) -> None:
 
 def frames(book: Book) -> None:
     """Pictures as in the paper's Fig. 1, 5 and 6."""
-    from cotap.evaluation.policy import default_checkpoint
-
     book.add("", "## Pictures", "", "Blue balls: the hands' reference. Red: the force.")
-    policy = default_checkpoint().stem
-    load = ["constant-load", "--num-envs", "1", "--no-randomize", "--checkpoint", policy]
+    policy = next((name for name in POLICIES if book.has(name)), "")
+    if not policy:
+        book.add("", f"Not drawn: {missing(POLICIES[0])}.")
+        return
+    checkpoint = book.policies[policy]
+    load = ["constant-load", "--num-envs", "1", "--no-randomize", "--checkpoint", checkpoint]
     stiff = ["--method", "cotap", "--stiffness", "300", "300"]
     picture(
         book,
@@ -491,7 +491,7 @@ def frames(book: Book) -> None:
         "1",
         "--no-randomize",
         "--checkpoint",
-        policy,
+        checkpoint,
         "--mode",
         "walking",
         "--motion",
@@ -512,11 +512,9 @@ def frames(book: Book) -> None:
 
 def singular(book: Book) -> None:
     """A reference with stretched arms, with and without the ratio: how far the arms stay from it, and a picture."""
-    from cotap.evaluation.policy import shipped_names
-
     rows = {
         "with the ratio": ("cotap", []),
-        "trained without the ratio": ("cotap-no-ratio", ["--no-singularity-ratio"]),
+        "trained without the ratio": ("no-ratio", ["--no-singularity-ratio"]),
         "ratio left out of the law alone": ("cotap", ["--no-singularity-ratio"]),
     }
     book.add(
@@ -526,42 +524,42 @@ def singular(book: Book) -> None:
         "A reference with both arms stretched forward, condition number 26, K_ee 100, standing; and the same with "
         "500 N for 50 ms backward on the left hand after 1 s. Window 1.5 to 3 s after the start.",
         "",
-        "| what | e_upper at rest [rad] | e_upper after the blow [rad] | e_ee of the hand that is hit [m] | fell |",
+        "| what | e_upper at rest [rad] | e_upper after the push [rad] | e_ee of the hand that is hit [m] | fell |",
         "|---|---|---|---|---|",
     )
     straight = ["impact", *ARMS["K 100"], *STRAIGHT, "--window", "0.5", "2"]
     for label, (name, args) in rows.items():
         rest = book.run(f"singular-rest-{slug(label)}", name, *straight, *CALM, *args)
-        blow = book.run(f"singular-{slug(label)}", name, *straight, *BACK, *args)
-        if rest is None or blow is None:
+        push = book.run(f"singular-{slug(label)}", name, *straight, *BACK, *args)
+        if rest is None or push is None:
             book.add(f"| {label} | {missing(name)} | | | |")
             continue
-        at_rest, after = (r["metrics_without_falls"] for r in (rest, blow))
+        at_rest, after = (r["metrics_without_falls"] for r in (rest, push))
         book.add(
             f"| {label} | {number(at_rest['e_upper'])} | {number(after['e_upper'])} | {number(after['e_ee_hit'])} "
-            f"| {fallen(blow)} |"
+            f"| {fallen(push)} |"
         )
     book.add("")
-    for when, row in (("at rest", "singular-rest"), ("after the blow", "singular")):
+    for when, row in (("at rest", "singular-rest"), ("after the push", "singular")):
         ordering(
             book, f"e_upper {when} with the ratio below that of the policy trained without it",
             f"{row}-with-the-ratio", f"{row}-trained-without-the-ratio", "e_upper",
         )  # fmt: skip
     one = [*straight, *BACK, "--num-envs", "1", "--no-randomize"]
     shown = [
-        (label, [*one, "--checkpoint", name, *args], (2.2,))
+        (label, [*one, "--checkpoint", book.policies[name], *args], (2.2,))
         for label, (name, args) in rows.items()
-        if name in shipped_names()
+        if book.has(name)
     ]
     if shown:
-        picture(book, "fig6", "One robot 1.2 s after the blow. Blue balls: where the reference has its hands.", shown)
+        picture(book, "fig6", "One robot 1.2 s after the push. Blue balls: where the reference has its hands.", shown)
 
 
 def main() -> int:
     """Parse, run everything, write the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="128 worlds a row; minutes instead of hours")
-    parser.add_argument("--num-envs", type=int, default=0, help="worlds a row; 4096, or 128 with --quick")
+    parser.add_argument("--quick", action="store_true", help="128 envs a row; minutes instead of hours")
+    parser.add_argument("--num-envs", type=int, default=0, help="envs a row; 4096, or 128 with --quick")
     parser.add_argument("--threads", type=int, default=0, help="0 takes every processor")
     parser.add_argument("--motion", default="mixture", help="the arms' reference in the impact tables")
     parser.add_argument(
@@ -571,6 +569,10 @@ def main() -> int:
         help="folder of results.md; docs, with --only runs/paper",
     )
     parser.add_argument("--reuse", action="store_true", help="keep evaluations that are there already")
+    parser.add_argument(
+        "--policies", nargs="*", default=[], metavar="NAME=CHECKPOINT",
+        help="policies of ablations (no-ratio, torque-critic, goals), or others in place of the shipped cotap and base",
+    )  # fmt: skip
     parser.add_argument("--only", nargs="*", default=[], help=f"parts: {', '.join(PARTS)}")
     options = parser.parse_args()
     unknown = sorted(set(options.only) - PARTS.keys())
@@ -583,7 +585,9 @@ def main() -> int:
     evaluations = Path("runs/paper-quick" if options.quick else "runs/paper") / "evaluations"
     for path in (out, evaluations):
         path.mkdir(parents=True, exist_ok=True)
-    book = Book(out, evaluations, options.num_envs or (128 if options.quick else 4096), options.threads, options.reuse)
+    policies = SHIPPED | {name: path for name, _, path in (text.partition("=") for text in options.policies)}
+    envs = options.num_envs or (128 if options.quick else 4096)
+    book = Book(out, evaluations, envs, options.threads, options.reuse, policies)
     book.add(*HEAD.format(command=" ".join(["scripts/reproduce_paper.py", *sys.argv[1:]]), envs=book.envs).splitlines())
     for name, part in PARTS.items():
         if not options.only or name in options.only:
@@ -594,20 +598,19 @@ def main() -> int:
 
 HEAD = """# The paper's tables and figures, measured here
 
-Written by `{command}`: do not edit. {envs} worlds a row unless said otherwise; means with bootstrap 95 %
-intervals over the worlds that stood (shares of falls: all worlds, to the end of the episode, Wilson's). Impact: 500 N
+Written by `{command}`: do not edit. {envs} envs a row unless said otherwise; means with bootstrap 95 %
+intervals over the envs that stood (shares of falls: all envs, to the end of the episode, Wilson's). Impact: 500 N
 for 50 ms at the left hand, +x in stance, in a random horizontal direction while walking at 0.5 m/s; window 1 s from the
 onset at 1 s of 3 s; friction, masses, gains and delay randomised; H1's own torque limits unless a factor is named.
-Every policy is simulated as it was trained last, with legs, arms and torso that collide. One training seed stands
-behind each: intervals are over worlds, not over trainings. Differences between two rows are taken world by world, over
+Every policy is simulated as it was trained, with legs, arms and torso that collide. One training seed stands behind
+each: intervals are over envs, not over trainings. Differences between two rows are taken env by env, over
 those that stood in both, and begin with the same friction, masses, motion and direction. The paper's figures (Isaac
-Gym, 4096 worlds, window and torque limits not given) stand beside ours: orderings and ratios are what compares, not
+Gym, 4096 envs, window and torque limits not given) stand beside ours: orderings and ratios are what compares, not
 digits, and [where they differ](#where-ours-differs-and-why) the page says why.
 
 Its Table I (properties of laws) is in [laws](laws/properties.md), its Table VI (static error) in
-[laws under a static load](laws/static.md), its Fig. 9 (after an impact) in [laws after a blow](laws/transient.md),
-Fig. 7's simulator in [sim to sim](sim_to_sim.md); what
-distillation did, in [distillation](distillation.md); all else of its evaluation is here.
+[laws under a static load](laws/static.md), its Fig. 9 (after an impact) in [laws after a push](laws/transient.md); all
+else of its evaluation is here.
 """
 
 

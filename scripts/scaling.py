@@ -23,17 +23,15 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from cotap.agents.ranks import Ranks
 from cotap.agents.runner import DualRunner
 from cotap.configs import BASE_RECIPES, to_plain
-from cotap.envs import H1Env
+from cotap.envs import HumanoidEnv
 
 LEARNING = ("command/error_velocity", "episode/falls_per_s", "command/e_upper", "curriculum/assist")
 RATE = "throughput/steps_per_s"
 
 
-def train(
-    folder: Path, processes: int, threads: int, worlds: int, iterations: int, seed: int
-) -> dict[str, list[float]]:
-    """Train in `processes` of `threads` each, `worlds` in all. Returns the curves, by name."""
-    options = ["base", "--num-envs", worlds // processes, "--threads", threads, "--iterations", iterations,
+def train(folder: Path, processes: int, threads: int, envs: int, iterations: int, seed: int) -> dict[str, list[float]]:
+    """Train in `processes` of `threads` each, `envs` in all. Returns the curves, by name."""
+    options = ["base", "--num-envs", envs // processes, "--threads", threads, "--iterations", iterations,
                "--seed", seed, "--run-dir", folder]  # fmt: skip
     launch = ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={processes}"] if processes > 1 else []
     environment = os.environ | {"OMP_NUM_THREADS": str(threads)}
@@ -44,14 +42,14 @@ def train(
     return {tag: [e.value for e in events.Scalars(tag)] for tag in (RATE, *LEARNING)}
 
 
-def measure(layouts: list[tuple[int, int]], worlds: int, iterations: int, seeds: int) -> list[dict[str, Any]]:
+def measure(layouts: list[tuple[int, int]], envs: int, iterations: int, seeds: int) -> list[dict[str, Any]]:
     """Every layout of processes x threads, for every seed in turn, so that a slow spell of the machine meets all."""
     runs: dict[tuple[int, int], list[dict[str, list[float]]]] = {layout: [] for layout in layouts}
     with tempfile.TemporaryDirectory(prefix="cotap-scaling-") as work:
         for seed in range(seeds):
             for processes, threads in layouts:
                 folder = Path(work) / f"{processes}x{threads}-{seed}"
-                runs[processes, threads].append(train(folder, processes, threads, worlds, iterations, seed))
+                runs[processes, threads].append(train(folder, processes, threads, envs, iterations, seed))
     tail = max(1, iterations // 5)
     out = []
     for (processes, threads), curves in runs.items():
@@ -110,7 +108,7 @@ def _count_in(rank: int, size: int, port: int, work: str) -> None:
     ranks_in_act = False
     with ranks.joined("cpu"):
         runner = DualRunner(
-            H1Env(training.env, size), training.runner, training.ppo, Path(work), to_plain(training), ranks=ranks
+            HumanoidEnv(training.env, size), training.runner, training.ppo, Path(work), to_plain(training), ranks=ranks
         )
         act, iterate = runner.alg.act, runner._iterate
         begins: list[tuple[Counter[str], Counter[str]]] = []
@@ -148,7 +146,7 @@ def main() -> int:
     commands.add_parser("count", help="messages and bytes per iteration")
     measuring = commands.add_parser("measure", help="throughput and learning of processes x threads")
     measuring.add_argument("--layouts", nargs="+", default=["1x2", "2x1", "1x1"], help="PROCESSESxTHREADS each")
-    measuring.add_argument("--worlds", type=int, default=1024, help="in all")
+    measuring.add_argument("--envs", type=int, default=1024, help="in all")
     measuring.add_argument("--iterations", type=int, default=60)
     measuring.add_argument("--seeds", type=int, default=3)
     measuring.add_argument("--json", type=Path, help="write the figures here")
@@ -157,8 +155,8 @@ def main() -> int:
         print(json.dumps(count(), indent=2))
         return 0
     layouts = [(int(k), int(t)) for k, _, t in (layout.partition("x") for layout in options.layouts)]
-    rows = measure(layouts, options.worlds, options.iterations, options.seeds)
-    print(f"{options.worlds} worlds, {options.iterations} iterations, {options.seeds} seeds\n\n{table(rows)}")
+    rows = measure(layouts, options.envs, options.iterations, options.seeds)
+    print(f"{options.envs} envs, {options.iterations} iterations, {options.seeds} seeds\n\n{table(rows)}")
     if options.json:
         options.json.write_text(json.dumps(rows, indent=2) + "\n")
     return 0

@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from cotap.envs import H1Env, H1EnvConfig
+from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 
 FOREVER = 10**9
 RATE = "throughput/steps_per_s"
@@ -45,7 +45,7 @@ class Reference:
     def __init__(self, threads: int) -> None:
         if threads:
             torch.set_num_threads(threads)
-        self._env = H1Env(H1EnvConfig(num_envs=REFERENCE_WORLDS, num_threads=threads))
+        self._env = HumanoidEnv(HumanoidEnvConfig(num_envs=REFERENCE_WORLDS, num_threads=threads))
         self._env.reset()
         self._begin = self._env.state_dict()
         self._rest = torch.zeros(REFERENCE_WORLDS, len(self._env.spec.joints))
@@ -171,7 +171,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--stage", choices=("base", "distill"), default="base")
-    parser.add_argument("--run-dir", type=Path, help="keep the run here; by default it is thrown away")
+    parser.add_argument("--run-dir", type=Path, help="keep the run here; by default it is deleted")
     parser.add_argument("--interval", type=float, default=5.0, help="seconds between samples of memory")
     parser.add_argument("--threads", type=int, default=0, help="of the training and the reference; 0: all")
     parser.add_argument(

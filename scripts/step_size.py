@@ -25,13 +25,13 @@ KP, KD, DEFAULT = (np.array([getattr(j, name) for j in h1().joints]) for name in
 
 def simulate(timestep_s: float, implicit: bool, targets: np.ndarray) -> tuple[np.ndarray, float]:
     """Joint angles (T, N, J) after every control step under `targets` (T, N, J), and seconds spent stepping."""
-    steps, worlds, _ = targets.shape
+    steps, envs, _ = targets.shape
     model = build_model(h1(), "feet", timestep_s)
     if not implicit:
         model.actuator_biasprm[:] = 0.0
-    batch = Batch(model, worlds)
+    batch = Batch(model, envs)
     qpos, qvel, ctrl = (batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
-    qpos[:, 2], qpos[:, 7:] = h1().nominal_height_m, DEFAULT
+    qpos[:, 2], qpos[:, 7:] = h1().base_height_m, DEFAULT
     out = np.empty_like(targets)
     spent = 0.0
     for t in range(steps):
@@ -48,7 +48,7 @@ def simulate(timestep_s: float, implicit: bool, targets: np.ndarray) -> tuple[np
 def main() -> int:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--worlds", type=int, default=256)
+    parser.add_argument("--envs", type=int, default=256)
     parser.add_argument("--seconds", type=float, default=0.5)
     parser.add_argument(
         "--spread", type=float, default=0.15, help="standard deviation of targets about the default [rad]"
@@ -58,7 +58,7 @@ def main() -> int:
     rng = np.random.default_rng(0)
     steps = round(options.seconds / CONTROL_DT)
     # Targets hold for five control steps, so that joints have time to go somewhere.
-    draws = rng.normal(size=(-(-steps // 5), options.worlds, len(DEFAULT))) * options.spread
+    draws = rng.normal(size=(-(-steps // 5), options.envs, len(DEFAULT))) * options.spread
     targets = DEFAULT + np.repeat(draws, 5, axis=0)[:steps]
     reference, _ = simulate(0.0005, True, targets)
     rms: dict[tuple[float, bool], np.ndarray] = {}

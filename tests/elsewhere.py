@@ -16,7 +16,7 @@ import torch
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from cotap.envs import h1_env
+from cotap.envs import humanoid_env
 from cotap.sim import BatchSimulation, Simulation
 
 DEVICE = "meta"
@@ -125,7 +125,7 @@ def _autocast(device_type: str, *args: Any, **kwargs: Any) -> Any:
 
 
 class _Simulation(BatchSimulation):
-    """mjbatch's worlds, seen as tensors on `DEVICE` that share its memory."""
+    """mjbatch's envs, seen as tensors on `DEVICE` that share its memory."""
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
@@ -153,6 +153,6 @@ def elsewhere(patch: Callable[..., None]) -> Iterator[None]:
     """Have `DEVICE` for a while, and environments simulate on it. `patch` is `monkeypatch.setattr`."""
     patch(torch, "Generator", _Generator)
     patch(torch, "autocast", _autocast)
-    patch(h1_env, "make_simulation", _make_simulation)
+    patch(humanoid_env, "make_simulation", _make_simulation)
     with _FromData(), _Operations():
         yield

@@ -48,69 +48,69 @@ def test_intervals_cover_a_true_difference_at_their_rate():
     assert 180 <= hits <= 199
 
 
-def with_worlds(values, stood=None, seed=0):
+def with_envs(values, stood=None, seed=0):
     r = result(x=summarize(torch.tensor([v for v in values if v is not None])))
     r["worlds"] = {"stood": [1.0] * len(values) if stood is None else stood, "x": values}
     r["settings"]["seed"] = seed
     return r
 
 
-def test_worlds_are_compared_one_by_one():
-    """Worlds differ by 0 to 99, the two evaluations by 0.5 in each: no doubt about it, however wide the means are."""
-    a, b = with_worlds([float(i) for i in range(100)]), with_worlds([i + 0.5 for i in range(100)])
+def test_envs_are_compared_one_by_one():
+    """Envs differ by 0 to 99, the two evaluations by 0.5 in each: no doubt about it, however wide the means are."""
+    a, b = with_envs([float(i) for i in range(100)]), with_envs([i + 0.5 for i in range(100)])
     row = compare(a, b)["differences"]["x"]
     assert row["difference"] == pytest.approx(0.5)
     assert row["ci95"] == pytest.approx([0.5, 0.5])
     assert row["pairs"] == 100
-    other = compare(a, with_worlds([i + 0.5 for i in range(100)], seed=1))["differences"]["x"]
+    other = compare(a, with_envs([i + 0.5 for i in range(100)], seed=1))["differences"]["x"]
     assert "pairs" not in other
     assert other["ci95"][0] < -5.0
 
 
-def test_worlds_that_fell_in_either_are_left_out_of_both():
-    a = with_worlds([1.0, 2.0, 3.0, 4.0], stood=[0.0, 1.0, 1.0, 1.0])
-    b = with_worlds([9.0, 2.5, 3.5, None], stood=[1.0, 1.0, 1.0, 1.0])
+def test_envs_that_fell_in_either_are_left_out_of_both():
+    a = with_envs([1.0, 2.0, 3.0, 4.0], stood=[0.0, 1.0, 1.0, 1.0])
+    b = with_envs([9.0, 2.5, 3.5, None], stood=[1.0, 1.0, 1.0, 1.0])
     for r in (a, b):
         r["metrics_without_falls"] = r["metrics"]
     row = compare(a, b, without_falls=True)["differences"]["x"]
     assert (row["difference"], row["pairs"], row["a"]) == (0.5, 2, 2.5)
 
 
-def test_shares_keep_their_width_and_one_world_has_none():
-    shares = [with_worlds([0.0] * 8) for _ in range(2)]
+def test_shares_keep_their_width_and_one_env_has_none():
+    shares = [with_envs([0.0] * 8) for _ in range(2)]
     for r in shares:
         r["metrics"]["x"] = summarize(torch.zeros(8, dtype=torch.bool))
-    low, high = compare(*shares)["differences"]["x"]["ci95"]
+    low, high = compare(shares[0], shares[1])["differences"]["x"]["ci95"]
     assert low < -0.2
     assert high > 0.2
-    row = compare(with_worlds([1.0, None]), with_worlds([2.5, 1.0]))["differences"]["x"]
-    assert (row["difference"], row["reason"]) == (None, "fewer than two worlds have both")
+    row = compare(with_envs([1.0, None]), with_envs([2.5, 1.0]))["differences"]["x"]
+    assert (row["difference"], row["reason"]) == (None, "fewer than two envs have both")
 
 
 @pytest.mark.parametrize(
-    ("worlds", "named"),
+    ("envs", "named"),
     [
         ([], "stood among them"),
         ({"x": [1.0]}, "stood among them"),
         ({"stood": [1.0], "x": 1.0}, "stood among them"),
-        ({"stood": [1.0], "x": [1.0, 2.0]}, "worlds.x has 2 worlds"),
+        ({"stood": [1.0], "x": [1.0, 2.0]}, "worlds.x has 2 envs"),
         ({"stood": [1.0], "x": ["1"]}, "finite numbers or null, got '1'"),
         ({"stood": [None], "x": [1.0]}, "stood must be 0 or 1, got None"),
         ({"stood": [0.5], "x": [1.0]}, "stood must be 0 or 1, got 0.5"),
     ],
 )
-def test_worlds_that_are_none_are_refused(tmp_path, capsys, worlds, named):
+def test_envs_that_are_none_are_refused(tmp_path, capsys, envs, named):
     file = tmp_path / "a.json"
-    file.write_text(json.dumps(result(x={"mean": 1.0, "ci95": [0.5, 1.5]}) | {"worlds": worlds}))
+    file.write_text(json.dumps(result(x={"mean": 1.0, "ci95": [0.5, 1.5]}) | {"worlds": envs}))
     assert main([str(file), str(file)]) == 2
     assert named in capsys.readouterr().err
 
 
 def test_what_one_could_not_measure_is_null_with_the_reason():
-    none = {"mean": None, "ci95": None, "reason": "no world"}
+    none = {"mean": None, "ci95": None, "reason": "no env"}
     d = difference(none, {"mean": 1.0, "ci95": [0.5, 1.5]})
     assert d["difference"] is None
-    assert d["reason"] == "A: no world"
+    assert d["reason"] == "A: no env"
 
 
 def test_settings_that_differ_are_listed():

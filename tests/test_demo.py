@@ -11,11 +11,23 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 import demo
 
+from cotap.evaluate import parse
 
-@pytest.mark.usefixtures("in_tmp_path")
+
+@pytest.fixture
+def shipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only the base is shipped; nothing reads it."""
+    (tmp_path / "h1-base.pt").touch()
+    monkeypatch.setattr("cotap.evaluation.policy.checkpoint_path", lambda name: tmp_path / f"{name}.pt")
+    monkeypatch.setenv("MUJOCO_GL", "osmesa")  # else the demo would set it for all tests that follow
+
+
+@pytest.mark.usefixtures("in_tmp_path", "shipped")
 @pytest.mark.parametrize("filmed", [True, False])
 def test_it_ends_with_the_command_that_the_readme_has_for_the_page(monkeypatch, capsys, filmed):
     def evaluate(arguments):
+        assert Path(arguments[arguments.index("--checkpoint") + 1]).name == "h1-base.pt"
+        parse(arguments)
         if "--json" in arguments:
             value = {"mean": 0.5, "ci95": [0.4, 0.6]}
             Path(arguments[arguments.index("--json") + 1]).write_text(
@@ -23,25 +35,33 @@ def test_it_ends_with_the_command_that_the_readme_has_for_the_page(monkeypatch, 
             )
         return 0 if filmed or "--video" not in arguments else 2
 
-    def train(_arguments):
+    def train(arguments):
+        assert arguments[:2] == ["distill", "--base-checkpoint"]
         (demo.OUT / "training").mkdir()
         (demo.OUT / "training" / f"checkpoint_{demo.ITERATIONS:06d}.pt").touch()
         return 0
 
-    monkeypatch.setenv("MUJOCO_GL", "osmesa")  # else the demo would set it for all tests that follow
     monkeypatch.setattr("cotap.evaluate.main", evaluate)
     monkeypatch.setattr("cotap.train.main", train)
     assert demo.main([]) == 0
     out = capsys.readouterr().out
-    assert "| worlds that fell | 0.500 (0.400 to 0.600) | 0.500 (0.400 to 0.600) |" in out
+    assert "| envs that fell | 0.500 (0.400 to 0.600) | 0.500 (0.400 to 0.600) |" in out
     command = ".venv/bin/python -m cotap.play"
     assert command in out.splitlines()[-1]
     assert f"`{command}`" in (Path(__file__).parents[1] / "README.md").read_text()
 
 
-@pytest.mark.usefixtures("in_tmp_path")
+@pytest.mark.usefixtures("in_tmp_path", "shipped")
 def test_it_ends_where_its_training_is_stopped(monkeypatch):
-    monkeypatch.setenv("MUJOCO_GL", "osmesa")
     monkeypatch.setattr("cotap.train.main", lambda _: 0)  # a training that is asked to stop ends in order
     monkeypatch.setattr("cotap.evaluate.main", None)
     assert demo.main([]) == 130
+
+
+@pytest.mark.usefixtures("in_tmp_path")
+def test_without_a_shipped_base_it_says_so(monkeypatch, tmp_path, capsys):
+    monkeypatch.setenv("MUJOCO_GL", "osmesa")
+    monkeypatch.setattr("cotap.evaluation.policy.checkpoint_path", lambda name: tmp_path / f"{name}.pt")
+    assert demo.main([]) == 2
+    assert "checkpoint 'h1-base' is not shipped" in capsys.readouterr().err
+    assert not demo.OUT.exists()

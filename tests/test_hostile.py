@@ -27,7 +27,7 @@ from cotap.compliance.laws import LawConfig
 from cotap.configs import BASE_RECIPES, BaseTraining, from_plain, to_plain
 from cotap.deployment import graph, trials
 from cotap.deployment.scenario import load_scenario
-from cotap.envs import H1Env
+from cotap.envs import HumanoidEnv
 from cotap.evaluation.law_options import parse_law
 from cotap.evaluation.policy import load_policy
 from cotap.evaluation.recording import (
@@ -58,7 +58,7 @@ else:
 
 EXAMPLES = int(os.environ.get("COTAP_FUZZ_EXAMPLES", "0"))
 """How many inputs each property is tried on; 0 for a few that are always the same."""
-# No shrinking: what is drawn is small as it is, and a failure should not take minutes to be told.
+# No shrinking: what is drawn is small as it is, and a failure should not take minutes to be seen.
 few = settings(
     max_examples=EXAMPLES or 15,
     derandomize=not EXAMPLES,
@@ -133,7 +133,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
     assert train.main(["base", *options, "--ppo.precision", "fp32", "--run-dir", str(folder / "run")]) == 0
     content = load_checkpoint(folder / "run" / "checkpoint_000001.pt")
     training = from_plain(BaseTraining, content["config"]["training"])
-    env = H1Env(training.env)
+    env = HumanoidEnv(training.env)
     return Trained(content, DualRunner(env, training.runner, training.ppo, folder, content["config"]), folder)
 
 
@@ -186,7 +186,7 @@ def exports(path: Path) -> None:
     ("env", "message"),
     [
         (None, "has no 'env' in its config"),
-        (3, "has no usable environment config: H1EnvConfig must be a table of fields, got int 3"),
+        (3, "has no usable environment config: HumanoidEnvConfig must be a table of fields, got int 3"),
         ({"control_dt": "x"}, "has no usable environment config: control_dt must be of type float, got str 'x'"),
         ({"control_dt": -1.0}, "has no usable environment config: control_dt must lie in"),
         ({"robot": "g7"}, "has no usable environment config: robot 'g7' is unknown"),
@@ -241,9 +241,9 @@ def test_a_changed_policy_is_used_or_refused(trained: Trained, use: Any, draw: s
 
 STATES = [
     ("env", "parts", "upper_body", "parameters", "alpha"),
-    ("env", "parts", "commands", "_stand"),
-    ("env", "delay", "delay_s"),
-    ("env", "last_action"),
+    ("env", "parts", "commands", "gait", "stand"),
+    ("env", "parts", "actuation", "delay_s"),
+    ("env", "parts", "observer", "last_action"),
     ("env", "observations", "policy"),
     ("learner", "optimizers", "lower", "state", 0, "exp_avg"),
 ]
@@ -320,11 +320,11 @@ def test_a_command_line_is_obeyed_or_refused(
     monkeypatch.setattr(train, "_train", lambda _stage, options, _base: options.training.check())
     monkeypatch.setattr(train, "train_both", lambda options: options.check())
 
-    def prepare(options: Any) -> None:
+    def check(_: str, options: Any) -> None:
         options.protocol.check()
         options.laws.configure()
 
-    monkeypatch.setattr(evaluate, "PROTOCOLS", {k: (kind, prepare) for k, (kind, _) in evaluate.PROTOCOLS.items()})
+    monkeypatch.setattr(evaluate, "run", check)
     for main in (train.main, evaluate.main):
         try:
             status = main(list(args))
@@ -342,7 +342,7 @@ class Begun(Exception):
 OPTIONS = {
     "motions": ["import", "show", "good.npz", "nowhere", "--output", "--format", "auto", "amass", "--mirror", "--clip",
                 "--robot", "h1"],
-    "export": ["--output", "p.onnx", "nowhere/p.onnx", "--checkpoint", "base", "--checks", "--seed"],
+    "export": ["--output", "p.onnx", "nowhere/p.onnx", "--checkpoint", "h1-base", "--checks", "--seed"],
     "deploy": ["--policy", "good.onnx", "--scenario", "good.toml", "--trials", "--seconds", "--arm-motion", "random",
                "--left", "cotap:alpha=0.7", "--seed", "--engine", "mujoco", "--timestep", "--delay-steps", "--json"],
     "compare": ["good.json", "--without-falls", "--json", "nowhere/o.json"],
@@ -424,9 +424,9 @@ hand = "left"
 def deploys(args: list[str], named: str, capsys: pytest.CaptureFixture[str]) -> None:
     """A file is used on a robot, or refused with an error that names it."""
     status = deploy.main([*args, "--seconds", "0.06"])
-    told = capsys.readouterr().err
+    said = capsys.readouterr().err
     assert status in (0, 2)
-    assert status == 0 or re.match(f"error: .*({named})", told, re.DOTALL), told
+    assert status == 0 or re.match(f"error: .*({named})", said, re.DOTALL), said
 
 
 @few
@@ -623,8 +623,8 @@ def test_an_evaluation_with_changed_parts_is_compared_or_refused(
     b.write_text(json.dumps(damage(RESULT, draw, json_values)))
     options = draw.draw(st.sampled_from([[], ["--without-falls"]]))
     status = compare.main([str(a), str(b), *options, "--json", str(out)])
-    told = capsys.readouterr().err
-    assert (status == 0 and not told) or (status == 2 and told.startswith("error: "))
+    said = capsys.readouterr().err
+    assert (status == 0 and not said) or (status == 2 and said.startswith("error: "))
 
 
 @few

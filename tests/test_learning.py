@@ -12,15 +12,12 @@ from cotap.agents.actors import DualActorCritic, as_dict
 from cotap.agents.checkpoint import load_checkpoint
 from cotap.agents.runner import layout_of
 from cotap.configs import BaseTraining, from_plain
-from cotap.envs import H1Env
+from cotap.envs import HumanoidEnv
 
 pytestmark = pytest.mark.slow
 
-# Unaided and unloaded, so that what the robots do is what they have learned.
-ALONE = ["--env.assist.no-enabled", "--env.hand-forces.no-enabled"]
 SIZE = ["--num-envs", "256", "--ppo.hidden", "64", "64", "--ppo.precision", "fp32"]
-ITERATIONS = 60
-WORLDS, STEPS = 128, 250
+ENVS, STEPS = 128, 250
 
 
 def learn(run_dir: Path, iterations: int, threads: int, *options: str) -> Path:
@@ -39,36 +36,38 @@ def judge(checkpoint: Path, trained: bool) -> dict[str, float]:
     """Means over a deterministic rollout from a seed of its own; untrained: of the networks that the run began with."""
     content = load_checkpoint(checkpoint)
     training = from_plain(BaseTraining, content["config"]["training"])
-    training.env.num_envs, training.env.seed = WORLDS, 1234
-    env = H1Env(training.env)
+    training.env.num_envs, training.env.seed = ENVS, 1234
+    env = HumanoidEnv(training.env)
     torch.manual_seed(training.seed)
     model = DualActorCritic(layout_of(env), training.ppo.hidden, training.ppo.initial_std)
     if trained:
         model.load_state_dict(content["model"])
     model.eval()
-    rewards, falls, height = torch.zeros(2), 0.0, 0.0
+    rewards, falls, height, slope = torch.zeros(2), 0.0, 0.0, 0.0
     for _ in range(STEPS):
         *_, extras = env.step(model(as_dict(env.get_observations())))
         rewards += extras["group_rewards"].mean(0)
         falls += float(extras["falls"].float().mean())
         height += float(extras["log"]["/command/error_height"])
+        slope += float(extras["log"]["/command/slope_x"])
     seconds = STEPS * env.dt
     return {
         "lower": float(rewards[0]) / seconds,
         "upper": float(rewards[1]) / seconds,
         "falls_per_s": falls / seconds,
         "error_height": height / STEPS,
+        "slope": slope / STEPS,
     }
 
 
-def test_a_short_run_learns_to_stay_up_and_to_keep_its_height(tmp_path: Path):
-    checkpoint = learn(tmp_path / "run", ITERATIONS, 1, *ALONE)
+def test_the_quick_recipe_learns_to_walk_with_the_wrench_that_assists(tmp_path: Path):
+    """The first quarter of a million of its samples, all of them under the whole wrench."""
+    checkpoint = learn(tmp_path / "run", 40, 1, "--recipe", "quick", "--runner.save-interval", "40")
     start, end = judge(checkpoint, trained=False), judge(checkpoint, trained=True)
     report = f"from {start} to {end}"
-    assert end["lower"] > start["lower"] + 0.6, report
-    assert end["falls_per_s"] < start["falls_per_s"], report
-    assert end["error_height"] < 0.9 * start["error_height"], report
-    assert end["upper"] > start["upper"] - 0.1, report
+    assert end["lower"] > start["lower"] + 0.2, report
+    assert end["slope"] > max(0.6, start["slope"]), report
+    assert end["falls_per_s"] == 0.0, report
 
 
 @pytest.mark.parametrize("threads", [1, 2])

@@ -7,19 +7,18 @@ import sys
 from pathlib import Path
 
 import pytest
+from random_policy import save_random_policy
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 import reproduce_paper as rp
 
 from cotap.agents.checkpoint import sha256
-from cotap.evaluation.policy import shipped_checkpoint
-
-OWN = sha256(shipped_checkpoint("base"))
 
 
 @pytest.fixture
 def book(tmp_path: Path) -> rp.Book:
-    return rp.Book(tmp_path, tmp_path, 4, 1, False)
+    policies = {"base": str(save_random_policy(tmp_path / "policy.pt"))}
+    return rp.Book(tmp_path, tmp_path, 4, 1, False, policies)
 
 
 def measured(mean: float, half: float) -> dict:
@@ -30,7 +29,7 @@ def measured(mean: float, half: float) -> dict:
 
 @pytest.mark.parametrize(
     ("larger", "verdict"),
-    [(20.0, "holds"), (5.0, "does not hold"), (10.2, "cannot be told apart"), (None, "not measured")],
+    [(20.0, "holds"), (5.0, "does not hold"), (10.2, "cannot be distinguished"), (None, "not measured")],
 )
 def test_an_ordering_gets_the_verdict_that_its_interval_allows(book, larger, verdict):
     book.results["small"] = measured(10.0, 0.5)
@@ -42,16 +41,16 @@ def test_an_ordering_gets_the_verdict_that_its_interval_allows(book, larger, ver
 
 def test_numbers_are_shown_with_interval_or_reason():
     assert rp.number({"mean": 0.12345, "ci95": [0.1, 0.2]}) == "0.123 (0.100 to 0.200)"
-    assert rp.number({"mean": None, "ci95": None, "reason": "no world stood"}) == "no world stood"
+    assert rp.number({"mean": None, "ci95": None, "reason": "no env stood"}) == "no env stood"
     assert rp.number({"mean": 31.0, "ci95": None, "reason": "wide"}, 0) == "31 (wide)"
 
 
-def test_what_is_not_shipped_is_a_row_that_says_so(book, monkeypatch):
-    monkeypatch.setattr("cotap.evaluation.policy.shipped_names", list)
+def test_what_there_is_no_checkpoint_of_is_a_row_that_says_so(book, monkeypatch):
+    book.policies = {}
     monkeypatch.setattr("cotap.evaluate.evaluate", lambda *_: pytest.fail("nothing may be measured"))
     rp.impacts(book, "stance", "cotap", 1.0, "mixture")
     rows = [line for line in book.lines if line.startswith("| K 100")]
-    assert "not shipped" in rows[0]
+    assert "no checkpoint of `cotap`: not measured" in rows[0]
     assert "0.861 / 0.101 / 46.664" in rows[0]  # the paper's own stay
     assert not book.results
     rp.ablations(book, "mixture", True)
@@ -59,7 +58,7 @@ def test_what_is_not_shipped_is_a_row_that_says_so(book, monkeypatch):
     rp.torque_observation(book)
     rp.fidelity(book, True)
     rp.robustness(book, True)
-    assert sum("not shipped" in line for line in book.lines) >= 20
+    assert sum("not measured" in line for line in book.lines) >= 20
 
 
 def test_an_error_without_bound_is_the_largest(book, monkeypatch):
@@ -91,12 +90,12 @@ def test_page_and_json_are_written(book, tmp_path):
 
 
 def test_only_evaluations_of_the_same_policy_and_settings_are_kept(book, monkeypatch):
-    """Neither one of another checkpoint nor one of other worlds or options is taken for what was asked for."""
+    """Neither one of another checkpoint nor one of other envs or options is taken for what was asked for."""
     asked = []
 
     def evaluate(arguments):
         asked.append(arguments)
-        return {"settings": {"checkpoint_sha256": OWN}}
+        return {"settings": {"checkpoint_sha256": sha256(book.policies["base"])}}
 
     monkeypatch.setattr("cotap.evaluate.evaluate", evaluate)
     path = book.evaluations / "row.json"
@@ -132,9 +131,11 @@ def test_differences_say_what_was_measured_and_what_was_not(book):
 
 @pytest.mark.slow
 def test_a_part_end_to_end(tmp_path, monkeypatch):
+    """With a policy that has learned nothing, and so falls."""
     monkeypatch.chdir(tmp_path)
-    arguments = ["reproduce_paper.py", "--quick", "--num-envs", "8", "--threads", "1", "--only", "load", "periodic"]
-    monkeypatch.setattr(sys, "argv", arguments)
+    policy = save_random_policy(tmp_path / "policy.pt", "distill")
+    arguments = ["--quick", "--num-envs", "8", "--threads", "1", "--policies", f"cotap={policy}", f"base={policy}"]
+    monkeypatch.setattr(sys, "argv", ["reproduce_paper.py", *arguments, "--only", "load", "periodic"])
     assert rp.main() == 0
     page = (tmp_path / "runs/paper-quick/results.md").read_text()
     assert "| K_z 500 |" in page

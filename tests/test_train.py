@@ -17,11 +17,10 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from cotap import train
 from cotap.agents.checkpoint import load_checkpoint, save_checkpoint
 from cotap.agents.runner import sole_writer
-from cotap.configs import BASE_RECIPES, CONTINUATIONS, DISTILL_RECIPES, BaseTraining, from_plain, to_plain
-from cotap.envs import H1Env
+from cotap.configs import BASE_RECIPES, DISTILL_RECIPES, BaseTraining, from_plain
+from cotap.envs import HumanoidEnv
 from cotap.envs.rewards import LowerRewards, UpperRewards
-from cotap.envs.upper_body import UpperBodyConfig
-from cotap.evaluation.policy import shipped_checkpoint
+from cotap.evaluation import policy
 
 # Every option that these tests use, as typed on the command line.
 ENVS = "--num-envs"
@@ -292,6 +291,9 @@ def test_a_resumed_run_keeps_its_config_but_for_what_is_overridden(checkpoint: P
     assert training["ppo"]["hidden"] == [8, 8]
     assert training["env"]["num_envs"] == 8
     assert training["runner"]["iterations"] == 3
+    (earlier,) = content["config"]["earlier_runs"]
+    assert GAMMA in earlier["command"]
+    assert LAM in content["config"]["command"]
 
 
 def test_a_resumed_run_ends_where_a_straight_one_does(checkpoint: Path, tmp_path: Path):
@@ -360,15 +362,15 @@ def test_a_run_repeats_for_its_seed_and_for_no_other(base: Path, tmp_path: Path)
 
 def interrupt(monkeypatch: pytest.MonkeyPatch, at: int, number: int) -> None:
     """Raise a signal in the environment's step of that number."""
-    step, calls = H1Env.step, []
+    step, calls = HumanoidEnv.step, []
 
-    def interrupted(self: H1Env, actions: torch.Tensor) -> Any:
+    def interrupted(self: HumanoidEnv, actions: torch.Tensor) -> Any:
         calls.append(1)
         if len(calls) == at:
             signal.raise_signal(number)
         return step(self, actions)
 
-    monkeypatch.setattr(H1Env, "step", interrupted)
+    monkeypatch.setattr(HumanoidEnv, "step", interrupted)
 
 
 def test_sigterm_saves_and_exits_cleanly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -416,15 +418,15 @@ def test_distillation_begins_as_the_base_under_compliance(checkpoint: Path, tmp_
     assert training["distillation"]["beta"] == 0.3
     for key, value in base["model"].items():
         if key.startswith("actors"):
-            free = key.startswith("actors.upper.output")  # of the agent that nobody guides, a share
-            torch.testing.assert_close(content["model"][key], 0.3 * value if free else value, atol=1e-3, rtol=0)
+            torch.testing.assert_close(content["model"][key], value, atol=1e-3, rtol=0)
         assert torch.equal(content["learner"]["guide"][key], value), key  # the guide is the base, unchanged
     logs = EventAccumulator(str(tmp_path / "run"))
     logs.Reload()
     tags = set(logs.Tags()["scalars"])
     assert {
         "agents/lower/base_kl", "agents/lower/base_beta", "agents/lower/base_share", "law/alpha",
-        "law/smallest_eigenvalue", "law/largest_eigenvalue", "law/projected", "law/saturated", "upper/stay_close",
+        "law/smallest_eigenvalue", "law/largest_eigenvalue", "law/projected", "law/saturated",
+        "upper/reference_closeness",
     } <= tags  # fmt: skip
     assert logs.Scalars("agents/lower/base_beta")[0].value == pytest.approx(0.3)
 
@@ -441,91 +443,77 @@ def test_a_resumed_distillation_ends_where_a_straight_one_does(checkpoint: Path,
         assert torch.equal(value, newest(first)["model"][key]), key
 
 
-def test_a_shipped_distilled_policy_goes_on_under_the_base_it_is_given(checkpoint: Path, tmp_path: Path):
-    distill(tmp_path / "run", checkpoint)
-    shipped = tmp_path / "cotap.pt"
-    save_checkpoint(shipped, newest(tmp_path / "run") | {"learner": {}, "env": {}})
-    more = [ITERATIONS, 3, RUN_DIR, tmp_path / "more"]
-    assert run("distill", RESUME, shipped, BASE_CHECKPOINT, checkpoint, *more) == 0
-    for key, value in load_checkpoint(checkpoint)["model"].items():
-        assert torch.equal(newest(tmp_path / "more")["learner"]["guide"][key], value), key
+def shipped(folder: Path, content: dict[str, Any], name: str = "shipped.pt") -> Path:
+    """A policy as the package ships it: no optimiser, no envs."""
+    save_checkpoint(folder / name, content | {"learner": {}, "env": {}, "others": []})
+    return folder / name
 
 
-def test_a_distilled_policy_begins_a_base_with_its_arms_under_pd(
-    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("stage", ["base", "distill"])
+def test_a_shipped_policy_does_not_go_on(
+    checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], stage: str
 ):
-    distill(tmp_path / "run", checkpoint, "--env.commands.waist-yield-s", 0.07)
-    (distilled,) = (tmp_path / "run").glob("checkpoint_000002.pt")
-    before = tree(tmp_path / "run")
-    monkeypatch.chdir(tmp_path)
-    slow = ["--ppo.learning-rate", 1e-5, "--ppo.epochs", 1, "--ppo.mini-batches", 1]
-    assert run("base", RESUME, distilled, ITERATIONS, 1, *slow) == 0
-    assert tree(tmp_path / "run") == before  # another stage is another run
-    (folder,) = (tmp_path / "runs").iterdir()
-    began, learned = newest(folder), load_checkpoint(distilled)
-    env = began["config"]["training"]["env"]
-    assert began["kind"] == "base"
-    assert "distillation" not in began["config"]["training"]
-    assert env["upper_body"] == to_plain(UpperBodyConfig())
-    assert env["commands"]["waist_yield_s"] == 0.07
-    assert train._parse_base([f"{RESUME}={distilled}"]).training.runner.iterations == 1225
-    assert began["iteration"] == 1
-    assert began["samples"] > learned["samples"]
-    assert not began["learner"]["guide"]
-    for key, value in learned["model"].items():
-        if key.startswith("actors"):
-            torch.testing.assert_close(began["model"][key], value, atol=1e-3, rtol=0)
+    content = load_checkpoint(checkpoint) if stage == "base" else distill(tmp_path / "run", checkpoint)
+    path = shipped(tmp_path, content)
+    assert run(stage, RESUME, path, RUN_DIR, tmp_path / "more", ITERATIONS, 3) == 2
+    assert "a shipped policy has no optimiser and cannot go on" in capsys.readouterr().err
+    assert not (tmp_path / "more").exists()
 
 
-def test_a_stage_does_not_resume_the_other_where_that_makes_no_sense(
-    checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_a_distillation_begins_from_a_shipped_base(checkpoint: Path, tmp_path: Path):
+    """Its optimisers are new, and Adam's first steps are as large as its rate: at a rate for learning from nothing
+    they would take the policy far away from itself in the first iteration."""
+    path = shipped(tmp_path, load_checkpoint(checkpoint))
+    distill(tmp_path / "run", path, ENVS, 64)
+    scalars = EventAccumulator(str(tmp_path / "run")).Reload()
+    for agent in ("lower", "upper"):
+        assert 0.0 <= scalars.Scalars(f"agents/{agent}/kl")[0].value < 0.03
+
+
+def test_a_stage_does_not_resume_the_other(checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert run("distill", RESUME, checkpoint) == 2
-    assert "begins from it with --base-checkpoint" in capsys.readouterr().err
+    assert "a checkpoint of stage 'base', not 'distill'" in capsys.readouterr().err
     distill(tmp_path / "run", checkpoint)
     before = tree(tmp_path / "run")
     assert run("base", RESUME, "auto", RUN_DIR, tmp_path / "run") == 2
-    assert "is of a distillation" in capsys.readouterr().err
+    assert "a checkpoint of stage 'distill', not 'base'" in capsys.readouterr().err
     assert tree(tmp_path / "run") == before
 
 
+@pytest.mark.parametrize("stage", ["base", "distill"])
+def test_a_run_that_goes_on_takes_no_recipe(
+    checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], stage: str
+):
+    resumed = checkpoint
+    if stage == "distill":
+        distill(tmp_path / "run", checkpoint)
+        resumed = max((tmp_path / "run").glob("checkpoint_*.pt"))
+    assert run(stage, RESUME, resumed, RECIPE, "paper") == 2
+    assert "--recipe 'paper': the run of --resume goes on with its own config" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(("recipe", "wider"), [("goals", 50), ("torque-critic", -40)])
-def test_an_ablation_goes_on_from_a_policy_that_saw_something_else(
+def test_an_ablation_begins_from_a_base_that_saw_something_else(
     checkpoint: Path, tmp_path: Path, recipe: str, wider: int
 ):
-    before = distill(tmp_path / "run", checkpoint)
-    more = [RECIPE, recipe, BASE_CHECKPOINT, checkpoint, ITERATIONS, 1, RUN_DIR, tmp_path / "more"]
-    assert run("distill", RESUME, max((tmp_path / "run").glob("checkpoint_*.pt")), *more) == 0
-    after = newest(tmp_path / "more")
+    content = distill(tmp_path / "run", checkpoint, RECIPE, recipe)
     key = "actors.lower.weights.0"
-    assert after["model"][key].shape[1] == before["model"][key].shape[1] + wider
-    assert after["config"]["training"]["distillation"]["beta"] == 0.0  # it has been guided
-    assert after["iteration"] == 1
-    # And goes on as any other.
-    assert run("distill", RESUME, max((tmp_path / "more").glob("checkpoint_*.pt")), RECIPE, recipe, ITERATIONS, 2) == 0
-    assert newest(tmp_path / "more")["iteration"] == 2
-
-
-@pytest.mark.parametrize("recipe", ["paper", "facet"])
-def test_a_recipe_that_begins_from_a_base_does_not_resume_a_distillation(
-    checkpoint: Path, tmp_path: Path, recipe: str, capsys: pytest.CaptureFixture[str]
-):
-    distill(tmp_path / "run", checkpoint)
-    assert run("distill", RESUME, max((tmp_path / "run").glob("checkpoint_*.pt")), RECIPE, recipe) == 2
-    said = capsys.readouterr().err
-    assert "recipe with --resume" in said
-    assert "no-ratio" in said
-
-
-def test_an_ablation_begins_from_a_base_that_saw_something_else(checkpoint: Path, tmp_path: Path):
-    content = distill(tmp_path / "run", checkpoint, RECIPE, "goals")
-    assert content["learner"]["guide"]["actors.lower.weights.0"][:, -50:].abs().max() == 0.0
+    assert content["model"][key].shape[1] == load_checkpoint(checkpoint)["model"][key].shape[1] + wider
     assert content["config"]["training"]["distillation"]["beta"] > 0.0
+    # And goes on as any other.
+    assert run("distill", RESUME, max((tmp_path / "run").glob("checkpoint_*.pt")), ITERATIONS, 3) == 0
+    assert newest(tmp_path / "run")["iteration"] == 3
 
 
-def test_the_papers_range_is_a_recipe(checkpoint: Path, tmp_path: Path):
-    content = distill(tmp_path / "run", checkpoint, RECIPE, "paper")
-    assert content["config"]["training"]["env"]["upper_body"]["sampling"]["stiffness"] == [150.0, 450.0]
+@pytest.mark.parametrize("recipe", DISTILL_RECIPES)
+def test_every_recipe_distils(checkpoint: Path, tmp_path: Path, recipe: str):
+    content = distill(tmp_path / "run", checkpoint, RECIPE, recipe)
+    kept = from_plain(BaseTraining, load_checkpoint(checkpoint)["config"]["training"])
+    expected = DISTILL_RECIPES[recipe](kept)
+    training = from_plain(type(expected), content["config"]["training"])
+    assert training.env.upper_body == expected.env.upper_body
+    assert training.env.rewards == expected.env.rewards
+    assert training.env.observations == expected.env.observations
 
 
 def test_distilling_from_a_distilled_policy_is_refused(
@@ -551,7 +539,7 @@ def tiny_networks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(train, "_parse_base", tiny)
 
 
-BOTH = [ENVS, 8, THREADS, 1, "--base-iterations", 2, "--robust-iterations", 1, "--distill-iterations", 1]
+BOTH = [ENVS, 8, THREADS, 1, "--base-iterations", 2, "--distill-iterations", 1]
 
 
 def test_stopped_in_a_stage_the_pipeline_ends_there_and_goes_on_from_there(
@@ -579,20 +567,29 @@ def test_going_on_with_the_pipeline_needs_to_know_where(capsys: pytest.CaptureFi
     assert "--run-dir" in capsys.readouterr().err
 
 
-def test_shipped_checkpoints_go_by_their_names_and_their_folder_is_left_alone(monkeypatch: pytest.MonkeyPatch):
-    options = captured(monkeypatch, "base", RESUME, "base")
-    assert Path(options.resume) == shipped_checkpoint("base")
-    assert Path(train._expand([BASE_CHECKPOINT, "base"])[-1].partition("=")[2]) == shipped_checkpoint("base")
+def test_shipped_checkpoints_go_by_their_names(checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    path = shipped(tmp_path, load_checkpoint(checkpoint), "h1-base.pt")
+    monkeypatch.setattr(policy, "checkpoint_path", lambda name: tmp_path / f"{name}.pt")
+    for given in ([BASE_CHECKPOINT, "h1-base"], []):  # named, and by default
+        assert train._parse_distill([str(a) for a in given]).base_checkpoint == str(path)
+
+
+def test_a_base_that_is_not_shipped_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr(policy, "checkpoint_path", lambda name: tmp_path / f"{name}.pt")
+    assert run("distill", RUN_DIR, tmp_path / "run") == 2
+    assert "checkpoint 'h1-base' is not shipped" in capsys.readouterr().err
 
 
 def test_going_on_from_a_checkpoint_of_no_run_begins_a_run_of_its_own(
     checkpoint: Path, tmp_path: Path, monkeypatch: Any
 ):
-    shipped = checkpoint.rename(checkpoint.with_name("mine.pt"))
-    before = tree(shipped.parent)
+    mine = checkpoint.rename(checkpoint.with_name("mine.pt"))
+    before = tree(mine.parent)
     monkeypatch.chdir(tmp_path)
-    assert run("base", RESUME, shipped, ITERATIONS, 3) == 0
-    assert tree(shipped.parent) == before
+    assert run("base", RESUME, mine, ITERATIONS, 3) == 0
+    assert tree(mine.parent) == before
     (folder,) = (tmp_path / "runs").iterdir()
     assert newest(folder)["iteration"] == 3
 
@@ -612,58 +609,11 @@ def test_without_a_stage_both_run_and_are_summed_up(tmp_path: Path, monkeypatch:
     tiny_networks(monkeypatch)
     out = tmp_path / "both"
     assert run(*BOTH, RUN_DIR, out) == 0
-    assert newest(out / "base")["kind"] == newest(out / "robust")["kind"] == "base"
-    assert not newest(out / "base")["config"]["training"]["env"]["blows"]["enabled"]
-    assert newest(out / "robust")["config"]["training"]["env"]["blows"]["enabled"]
+    assert newest(out / "base")["kind"] == "base"
     assert newest(out / "distill")["kind"] == "distill"
     said = capsys.readouterr().out
     assert "| base | 2 | 96 |" in said
-    assert "| robust | 3 | 144 |" in said
     assert "| distill | 1 | 48 |" in said
-
-
-def test_a_recipe_that_goes_on_changes_the_checkpoints_config(monkeypatch: pytest.MonkeyPatch, checkpoint: Path):
-    options = captured(monkeypatch, "base", RESUME, checkpoint, RECIPE, "robust", LAM, 0.9)
-    kept = from_plain(BaseTraining, load_checkpoint(checkpoint)["config"]["training"])
-    expected = CONTINUATIONS["robust"](kept)
-    expected.ppo.lam = 0.9
-    assert options.training == expected
-    assert options.training.ppo.hidden == kept.ppo.hidden
-    assert options.training.env.blows.enabled
-    assert options.training.env.hand_forces.enabled
-    assert not kept.env.blows.enabled
-
-
-def test_robust_walks_as_well_and_takes_blows_and_loads():
-    walk, robust = (CONTINUATIONS[name](BASE_RECIPES["default"]()) for name in ("walk", "robust"))
-    assert not walk.env.blows.enabled
-    assert not walk.env.hand_forces.enabled
-    assert robust.env.blows.enabled
-    assert robust.env.hand_forces.enabled
-    assert walk.env.collision == robust.env.collision == "full"
-    assert walk.env.rewards == robust.env.rewards
-    assert walk.ppo == robust.ppo
-
-
-def test_distillation_brings_blows_and_loads_to_a_base_that_never_met_them():
-    env = DISTILL_RECIPES["default"](CONTINUATIONS["walk"](BASE_RECIPES["default"]())).env
-    assert env.blows.enabled
-    assert env.hand_forces.enabled
-    assert env.rewards.upper.steady_torso == 0.0
-
-
-def test_feet_that_are_further_apart_than_a_recipe_asks_stay_so():
-    wide = BaseTraining()
-    wide.env.commands.step_apart_m, wide.env.commands.step_clear_m = 0.12, 0.1
-    commands = CONTINUATIONS["robust"](wide).env.commands
-    assert (commands.step_apart_m, commands.step_clear_m) == (0.12, 0.25)
-
-
-def test_a_recipe_that_begins_from_nothing_does_not_resume(checkpoint: Path, capsys: pytest.CaptureFixture[str]):
-    assert run("base", RESUME, checkpoint, RECIPE, "paper") == 2
-    said = capsys.readouterr().err
-    assert "recipe with --resume" in said
-    assert "robust" in said
 
 
 @pytest.mark.parametrize(
@@ -673,14 +623,3 @@ def test_a_recipe_that_begins_from_nothing_does_not_resume(checkpoint: Path, cap
 def test_bad_options_of_both_stages_are_named(options: list[Any], needle: str, capsys: pytest.CaptureFixture[str]):
     assert run(*options) == 2
     assert needle in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("command", [["base", RESUME], ["distill", BASE_CHECKPOINT]], ids=["base", "distill"])
-def test_a_shipped_policy_goes_on_from_what_it_is(command: list[str], tmp_path: Path):
-    """Its optimisers are new, and Adam's first steps are as large as its rate: at a rate for learning from nothing they
-    take the policy 1.5 nats away from itself in the first iteration, and it takes hundreds of them to come back."""
-    folder = tmp_path / "run"
-    assert run(*command, "base", ITERATIONS, 1, ENVS, 64, THREADS, 1, RUN_DIR, folder) == 0
-    scalars = EventAccumulator(str(folder)).Reload()
-    for agent in ("lower", "upper"):
-        assert 0.0 < scalars.Scalars(f"agents/{agent}/kl")[0].value < 0.03

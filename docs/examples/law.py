@@ -1,11 +1,12 @@
-"""A law of one's own: PD that bears the arms' weight, as soft as `alpha` says. Run in a world with a load on a hand."""
+"""A law of your own: PD that carries the arms' weight, as soft as `alpha` says; measured under a load on a hand."""
 
 import torch
 
 from cotap.compliance.dynamics import gravity_torque
 from cotap.compliance.interface import Arms, ArmState, LawParameters, LawReport, TorqueLaw
 from cotap.compliance.laws import LAWS, LawConfig
-from cotap.envs import H1Env, H1EnvConfig
+from cotap.envs import HumanoidEnv, HumanoidEnvConfig
+from cotap.envs.scripted_forces import ForceProfile
 
 
 class FloatingPD:
@@ -24,20 +25,20 @@ class FloatingPD:
         return law, LawReport({"gain": gain.mean(-1)})
 
 
-LAWS["floating-pd"] = lambda arms, _: FloatingPD(arms)  # in the package: a line in `LAWS`
+LAWS["floating-pd"] = lambda arms, _: FloatingPD(arms)  # in the package: one line in `LAWS`
 
-cfg = H1EnvConfig(num_envs=2, num_threads=1, fixed_base=True)
+cfg = HumanoidEnvConfig(num_envs=2, num_threads=1, fixed_base=True)
 cfg.upper_body.left = LawConfig("floating-pd", alpha=0.6)
-cfg.hand_forces.enabled = cfg.randomization.enabled = False
-cfg.force.force, cfg.force.start_s = (0.0, 0.0, -5.0), 1.0  # on the left hand [N]
-env = H1Env(cfg)
+cfg.randomization.enabled = False
+cfg.forces.scripted = ForceProfile((0.0, 0.0, -5.0), "left", start_s=1.0)
+env = HumanoidEnv(cfg)
 env.motions.hold(env.motions.default)
-env.upper_body.parameters.alpha[1] = 0.0  # worlds differ, and may at any step
+env.upper_body.parameters.alpha[1] = 0.0  # envs may differ, at any step
 env.reset()
 for _ in range(50):
-    env.step(torch.zeros(2, 19))
+    env.step(torch.zeros(2, env.num_actions))
 before = env.state.arms.tip[:, 0, 2].clone()
 for _ in range(100):
-    env.step(torch.zeros(2, 19))
+    env.step(torch.zeros(2, env.num_actions))
 sag = before - env.state.arms.tip[:, 0, 2]
 print(sag)  # [m], the soft arm's and the stiff one's

@@ -22,8 +22,9 @@ def _register() -> None:
         return
     register(
         id="CoTaP/H1-v0",
-        entry_point="cotap.envs.gym:H1SingleEnv",
-        vector_entry_point="cotap.envs.gym:H1VectorEnv",
+        entry_point="cotap.envs.gymnasium:HumanoidSingleEnv",
+        vector_entry_point="cotap.envs.gymnasium:HumanoidVectorEnv",
+        kwargs={"robot": "h1"},
     )
 
 

@@ -23,7 +23,7 @@ class CompareOptions:
     b: Annotated[str, tyro.conf.Positional]
     """Another's."""
     without_falls: bool = False
-    """Compare the figures of worlds that stood."""
+    """Compare the figures of envs that stood."""
     json: str = ""
     """Write the differences here."""
 
@@ -59,7 +59,7 @@ def read(path: str) -> dict[str, Any]:
         for name, summary in content.get(part, {}).items():
             _require_summary(f"{path!r}: {part}.{name}", summary)
     if "worlds" in content:
-        _require_worlds(f"{path!r}: worlds", content["worlds"])
+        _require_envs(f"{path!r}: worlds", content["worlds"])
     return content
 
 
@@ -75,23 +75,23 @@ def _require_summary(where: str, summary: Any) -> None:
         raise ValueError(f"{where}.ci95 must be two finite numbers or null, got {interval!r:.80}")
 
 
-def _require_worlds(where: str, worlds: Any) -> None:
+def _require_envs(where: str, envs: Any) -> None:
     """Raise ValueError unless these are lists of numbers or nulls, all of one length, `stood` among them."""
-    if not isinstance(worlds, dict) or "stood" not in worlds or not all(isinstance(v, list) for v in worlds.values()):
+    if not isinstance(envs, dict) or "stood" not in envs or not all(isinstance(v, list) for v in envs.values()):
         raise ValueError(f"{where} must be lists by name, stood among them")
-    for name, values in worlds.items():
-        if len(values) != len(worlds["stood"]):
-            raise ValueError(f"{where}.{name} has {len(values)} worlds, stood has {len(worlds['stood'])}")
+    for name, values in envs.items():
+        if len(values) != len(envs["stood"]):
+            raise ValueError(f"{where}.{name} has {len(values)} envs, stood has {len(envs['stood'])}")
         if wrong := [v for v in values if v is not None and not is_finite(v)]:
             raise ValueError(f"{where}.{name} must be finite numbers or null, got {wrong[0]!r:.80}")
-    if wrong := [v for v in worlds["stood"] if v not in (0, 1)]:
+    if wrong := [v for v in envs["stood"] if v not in (0, 1)]:
         raise ValueError(f"{where}.stood must be 0 or 1, got {wrong[0]!r:.80}")
 
 
 def compare(a: dict[str, Any], b: dict[str, Any], without_falls: bool = False) -> dict[str, Any]:
     """Differences of all measures that both have, and the settings in which they differ.
 
-    Where both have every world's figures (`--worlds`) of as many worlds and one seed, worlds are compared one by one:
+    Where both have every env's figures (`--worlds`) of as many envs and one seed, envs are compared one by one:
     what friction, motion or direction does to a measure it does to both, and drops out. Otherwise the interval of a
     difference follows from those of its terms, taken to be independent (the square-and-add method of Zou and Donner
     2008, Newcombe's for shares).
@@ -114,11 +114,11 @@ def compare(a: dict[str, Any], b: dict[str, Any], without_falls: bool = False) -
 
 
 def measure_difference(a: dict[str, Any], b: dict[str, Any], name: str, without_falls: bool) -> dict[str, Any]:
-    """`b - a` of one measure of two evaluations, world by world where both have them; as `difference`."""
+    """`b - a` of one measure of two evaluations, env by env where both have them; as `difference`."""
     old, new = (x.get("worlds", {}).get(name, []) for x in (a, b))
     seeds = [x["settings"].get("seed") for x in (a, b)]
     paired = old and len(old) == len(new) and seeds[0] is not None and seeds[0] == seeds[1]
-    # A bootstrap of shares has no width where all worlds agree; Newcombe's interval has.
+    # A bootstrap of shares has no width where all envs agree; Newcombe's interval has.
     if paired and not {*old, *new} <= {0.0, 1.0, None}:
         return paired_difference(a["worlds"], b["worlds"], name, without_falls)
     key = "metrics_without_falls" if without_falls else "metrics"
@@ -126,13 +126,13 @@ def measure_difference(a: dict[str, Any], b: dict[str, Any], name: str, without_
 
 
 def paired_difference(a: dict[str, Any], b: dict[str, Any], name: str, without_falls: bool) -> dict[str, Any]:
-    """Mean of `b - a` over the worlds that have the measure in both, with its bootstrap interval.
+    """Mean of `b - a` over the envs that have the measure in both, with its bootstrap interval.
 
     Args:
-        a: Lists by measure, a figure or null for every world.
+        a: Lists by measure, a figure or null for every env.
         b: The same of the other evaluation.
         name: The measure.
-        without_falls: Leave out worlds that fell in either.
+        without_falls: Leave out envs that fell in either.
     """
     import torch
 
@@ -144,7 +144,7 @@ def paired_difference(a: dict[str, Any], b: dict[str, Any], name: str, without_f
         both &= torch.tensor(a["stood"]).bool() & torch.tensor(b["stood"]).bool()
     summary = summarize((new - old)[both])
     if summary["n"] < 2:
-        return {"a": None, "b": None, "difference": None, "ci95": None, "reason": "fewer than two worlds have both"}
+        return {"a": None, "b": None, "difference": None, "ci95": None, "reason": "fewer than two envs have both"}
     means = {"a": float(old[both].mean()), "b": float(new[both].mean())}
     return means | {"difference": summary["mean"], "ci95": summary["ci95"], "pairs": summary["n"]}
 
@@ -186,7 +186,7 @@ def table(result: dict[str, Any]) -> str:
             f"| {differs} |"
         )
     if pairs := [row["pairs"] for row in result["differences"].values() if "pairs" in row]:
-        lines += ["", f"Compared world by world, {min(pairs)} to {max(pairs)} worlds a measure."]
+        lines += ["", f"Compared env by env, {min(pairs)} to {max(pairs)} envs a measure."]
     lines += ["", *(f"{name}: {old} -> {new}" for name, (old, new) in result["settings"].items())]
     return "\n".join(lines)
 

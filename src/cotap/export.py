@@ -14,12 +14,13 @@ from cotap.files import require_output
 
 @dataclass
 class ExportOptions:
-    """Both actors, observation normalisation and what is fed forward, with the metadata that a robot needs."""
+    """Observation to joint targets, with the metadata that a robot's loop needs."""
 
     output: str
     """Where the ONNX file goes."""
     checkpoint: str = ""
-    """Checkpoint to export, a file or the name of a shipped one; by default the shipped CoTaP policy."""
+    """Checkpoint to export, a file or the name of a shipped one; by default the shipped distilled policy, or else the
+    base."""
     checks: int = 1000
     """Observations over which the file is compared with torch before it is kept."""
     seed: int = 0

@@ -19,19 +19,21 @@ from cotap import __version__
 from cotap.checks import require_one_of, require_positive_int, require_range
 from cotap.configs import (
     BASE_RECIPES,
-    CONTINUATIONS,
-    DISTILL_CONTINUATIONS,
     DISTILL_RECIPES,
     OTHER_TERMS,
     BaseTraining,
     DistillTraining,
-    as_base,
     from_plain,
     to_plain,
 )
 from cotap.sim import resolve_backend
 
-SHORTCUTS = {"--num-envs": "--env.num-envs", "--iterations": "--runner.iterations", "--backend": "--env.backend"}
+SHORTCUTS = {
+    "--robot": "--env.robot",
+    "--num-envs": "--env.num-envs",
+    "--iterations": "--runner.iterations",
+    "--backend": "--env.backend",
+}
 STAGES = ("base", "distill")
 
 
@@ -39,18 +41,18 @@ STAGES = ("base", "distill")
 class BaseOptions:
     """Stage 1: a base policy. Legs follow velocity, yaw rate, height and stand commands; arms follow a reference.
 
-    `--num-envs`, `--iterations` and `--backend` are short for `--env.num-envs`, `--runner.iterations`, `--env.backend`.
+    `--robot`, `--num-envs`, `--iterations` and `--backend` are short for `--env.robot`, `--env.num-envs`,
+    `--runner.iterations` and `--env.backend`.
     """
 
     run_dir: str = ""
     """Where the run goes; by default the folder of the run that is resumed, or else runs/base-DATE-TIME."""
     resume: str = ""
-    """Checkpoint to go on from, a file or the name of a shipped one; its config is the default for every option. auto:
-    the newest in --run-dir, if any. A distilled policy begins a new run, with its arms back under PD."""
+    """Checkpoint of a run to go on from; its config is the default for every option. auto: the newest in --run-dir, if
+    any."""
     recipe: str = "default"
-    """default (from nothing to walking); paper (the same with the paper's networks); walk (to walk and stand well, arms
-    moving) and robust (that, and blows and loads on the hands): with --resume, what a policy that walks learns next,
-    from nothing without it; or facet (FACET's tracking reward)."""
+    """default (what ships), quick (walking in the shortest time), paper (the paper's settings) or facet (FACET's
+    tracking reward)."""
     command: tyro.conf.Suppress[str] = ""
     training: Annotated[BaseTraining, tyro.conf.arg(name="")] = field(default_factory=BASE_RECIPES["default"])
 
@@ -65,49 +67,48 @@ class DistillOptions:
     run_dir: str = ""
     """Where the run goes; by default the folder of the run that is resumed, or else runs/distill-DATE-TIME."""
     resume: str = ""
-    """Checkpoint of a distillation to go on from, a file or the name of a shipped one; its config is the default for
-    every option. auto: the newest in --run-dir, if any. A shipped one is guided no more."""
+    """Checkpoint of a distillation to go on from; its config is the default for every option. auto: the newest in
+    --run-dir, if any."""
     base_checkpoint: str = ""
     """Base policy to begin from and to be guided by, a file or the name of a shipped one; by default the shipped
     one."""
     recipe: str = "default"
     """default (80 to 1200 N/m); paper (150 to 450 N/m); facet (arms under FACET, its tracking reward);
-    or an ablation: no-ratio, torque-critic, goals. With --resume an ablation changes that checkpoint's config. The last
-    two change what the networks see; those that they begin from are refitted."""
+    or an ablation: no-ratio, torque-critic, goals. The last two change what networks see; the base's are refitted."""
     command: tyro.conf.Suppress[str] = ""
     training: Annotated[DistillTraining, tyro.conf.arg(name="")] = field(default_factory=DistillTraining)
 
 
 @dataclass
 class PipelineOptions:
-    """Both stages: a base policy that walks, then takes blows and loads, then its distillation. For more options:
+    """Both stages: a base policy, then its distillation under compliance. For more options:
     `python -m cotap.train base --help`, `python -m cotap.train distill --help`."""
 
     run_dir: str = ""
-    """Where the runs go, into folders `base`, `robust` and `distill`; by default runs/cotap-DATE-TIME."""
+    """Where the runs go, into folders `base` and `distill`; by default runs/cotap-DATE-TIME."""
+    robot: str = "h1"
+    """Name of the robot."""
     resume: bool = False
     """Go on with the runs in --run-dir: what is finished is left, what was stopped goes on, what is missing begins."""
-    num_envs: int = 1024
-    """Number of worlds."""
-    base_iterations: int = 814
-    """Iterations of stage 1 from nothing to walking."""
-    robust_iterations: int = 400
-    """Iterations of stage 1 after that, with blows and loads on the hands."""
-    distill_iterations: int = 2400
+    num_envs: int = 2048
+    """Number of envs."""
+    base_iterations: int = 6103
+    """Iterations of stage 1."""
+    distill_iterations: int = 3051
     """Iterations of stage 2."""
     seed: int = 0
     """Seed of both stages."""
     threads: int = 0
-    """Processor threads; 0 takes every processor."""
+    """CPU threads; 0 takes every core."""
     backend: str = "auto"
-    """What simulates, in all stages: mjbatch (the processor), warp (a graphics card), or auto: warp where there is one
+    """What simulates, in all stages: mjbatch (the CPU), warp (a GPU), or auto: warp where there is one
     and the extra `warp`."""
     device: str = "cpu"
     """Where the networks live, in all stages."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
-        for name in ("num_envs", "base_iterations", "robust_iterations", "distill_iterations"):
+        for name in ("num_envs", "base_iterations", "distill_iterations"):
             require_positive_int(name, getattr(self, name))
         require_range("threads", self.threads, 0, 4096)
         resolve_backend(self.backend)
@@ -183,20 +184,11 @@ def _named(key: str) -> str:
 
 def _parse_base(args: list[str]) -> BaseOptions:
     """Options on top of the resumed checkpoint's config, or else of the recipe's."""
-    newest = _resumes_newest(args)
     args = _expand(args)
     recipe, resumed = _peek(args, "--recipe"), _peek(args, "--resume")
-    if recipe:
-        require_one_of("recipe", recipe, BASE_RECIPES.keys())
+    require_one_of("recipe", recipe or "default", BASE_RECIPES.keys())
     if resumed:
-        distilled = _stage_of(resumed) == "distill"
-        if distilled and newest:
-            raise ValueError(
-                f"--resume auto: {resumed} is of a distillation; a base that begins from it is another run"
-            )
-        training = as_base(_config_of(resumed, DistillTraining)) if distilled else _config_of(resumed, BaseTraining)
-        if recipe:
-            training = CONTINUATIONS[require_one_of("recipe with --resume", recipe, CONTINUATIONS.keys())](training)
+        training = _resumed_config(resumed, recipe, "base", BaseTraining)
     else:
         training = BASE_RECIPES[recipe or "default"]()
     default = BaseOptions(recipe=recipe or "default", training=training)
@@ -212,36 +204,32 @@ def _parse_distill(args: list[str]) -> DistillOptions:
     given, resumed, base = (_peek(args, option) for option in ("--recipe", "--resume", "--base-checkpoint"))
     recipe = require_one_of("recipe", given or "default", DISTILL_RECIPES.keys())
     if resumed:
-        if _stage_of(resumed) != "distill":
-            raise ValueError(f"--resume {resumed!r}: not of a distillation; one begins from it with --base-checkpoint")
-        before = training = _config_of(resumed, DistillTraining)
-        if given:
-            require_one_of("recipe with --resume", given, DISTILL_CONTINUATIONS.keys())
-            training = DISTILL_CONTINUATIONS[given](training)
-        guided = _brings_guide(resumed) and training.env.observations == before.env.observations
-        if guided and base and not begins:
+        training = _resumed_config(resumed, given, "distill", DistillTraining)
+        if base and not begins:
             raise ValueError(f"--base-checkpoint {base!r}: checkpoint {resumed!r} brings the base that guides it")
-        if not guided:  # what the base had to say has been learned; iterations count from nothing, and so would beta
-            training.distillation.beta = 0.0
-            base = base or str(shipped_checkpoint("base"))
+        base = ""
     else:
-        base = base or str(shipped_checkpoint("base"))
+        base = base or str(shipped_checkpoint("h1-base"))
         training = DISTILL_RECIPES[recipe](_config_of(base, BaseTraining))
     default = DistillOptions(recipe=recipe, base_checkpoint=base, training=training)
     return tyro.cli(DistillOptions, args=args, default=default, prog="python -m cotap.train distill")
 
 
-def _stage_of(checkpoint: str) -> str:
+def _resumed_config(checkpoint: str, recipe: str, stage: str, kind: type[Any]) -> Any:
+    """The config of a run that goes on. Raises ValueError for one that cannot, or would become another run."""
     from cotap.agents.checkpoint import load_checkpoint
 
-    return load_checkpoint(checkpoint).get("kind", "base")
-
-
-def _brings_guide(checkpoint: str) -> bool:
-    """Whether a distillation's checkpoint has the base that guides it; a shipped one has not."""
-    from cotap.agents.checkpoint import load_checkpoint
-
-    return bool(load_checkpoint(checkpoint).get("learner"))
+    content = load_checkpoint(checkpoint)
+    if content.get("kind", stage) != stage:
+        raise ValueError(f"--resume {checkpoint!r}: a checkpoint of stage {content['kind']!r}, not {stage!r}")
+    if not content.get("learner"):
+        raise ValueError(
+            f"--resume {checkpoint!r}: a shipped policy has no optimiser and cannot go on; train from nothing, or "
+            "distill with --base-checkpoint"
+        )
+    if recipe:
+        raise ValueError(f"--recipe {recipe!r}: the run of --resume goes on with its own config")
+    return _config_of(checkpoint, kind)
 
 
 def _config_of(checkpoint: str, kind: type[Any]) -> Any:
@@ -294,26 +282,27 @@ def _train(stage: str, options: BaseOptions | DistillOptions, base: dict[str, An
     from cotap.agents.ranks import Ranks
     from cotap.agents.run_log import say
     from cotap.agents.runner import CHECKPOINT_PATTERN, DualRunner, check_run_dir, sole_writer
-    from cotap.envs import H1Env
+    from cotap.envs import HumanoidEnv
 
     training, ranks = options.training, Ranks.from_environment()
     resumed = Path(options.resume) if options.resume else None
-    # A checkpoint that is no part of a run of this stage, as a shipped one, is gone on from elsewhere.
-    of_a_run = resumed and resumed.match(CHECKPOINT_PATTERN) and _stage_of(options.resume) == stage
-    resumed_dir = resumed.parent if resumed and of_a_run else None
+    # A checkpoint that was copied out of its run goes on elsewhere.
+    resumed_dir = resumed.parent if resumed and resumed.match(CHECKPOINT_PATTERN) else None
     if ranks.size > 1 and not (options.run_dir or resumed_dir):
         raise ValueError("several processes need one --run-dir, got none")
     run_dir = Path(options.run_dir) if options.run_dir else resumed_dir or _new_run_dir(stage)
     training.env.seed, training.env.num_threads = training.seed, training.threads
     training.check()
     config = {"stage": stage, "training": to_plain(training), **provenance(options.command, training.env.backend)}
+    if options.resume:
+        config["earlier_runs"] = _runs_behind(options.resume)
     training.env.seed, training.env.num_threads = ranks.seed(training.seed), ranks.threads(training.threads)
     training.device = ranks.device(training.device)
     if training.env.num_threads:
         torch.set_num_threads(training.env.num_threads)
     torch.manual_seed(training.seed)  # networks begin alike everywhere
     with ranks.joined(training.device):
-        env = H1Env(training.env, ranks.size)
+        env = HumanoidEnv(training.env, ranks.size)
         guide = _guide(env, options, base) if isinstance(options, DistillOptions) else None
         runner = DualRunner(env, training.runner, training.ppo, run_dir, config, training.device, guide, ranks)
         if guide and not options.resume:
@@ -322,7 +311,7 @@ def _train(stage: str, options: BaseOptions | DistillOptions, base: dict[str, An
         if ranks.size > 1:
             torch.manual_seed(training.env.seed)
         if options.resume:
-            runner.load(options.resume, other_terms=options.recipe in OTHER_TERMS)
+            runner.load(options.resume)
         # Last, so that nothing is left behind when any of the above refuses.
         if ranks.leads:
             check_run_dir(run_dir, resumed if resumed_dir else None)
@@ -331,6 +320,15 @@ def _train(stage: str, options: BaseOptions | DistillOptions, base: dict[str, An
     if ranks.leads:
         say(f"{runner.current_learning_iteration} iterations, {runner.wall_seconds:.0f} s: {run_dir}")
     return run_dir
+
+
+def _runs_behind(checkpoint: str) -> list[dict[str, str]]:
+    """Command and commit of the runs that a checkpoint comes from, oldest first."""
+    from cotap.agents.checkpoint import load_checkpoint
+
+    config = load_checkpoint(checkpoint)["config"]
+    earlier, own = config.get("earlier_runs", []), {key: config.get(key, "") for key in ("command", "commit")}
+    return [*(earlier if isinstance(earlier, list) else []), own]
 
 
 def _guide(env: Any, options: DistillOptions, base: dict[str, Any] | None) -> Any:
@@ -360,9 +358,7 @@ def train_both(options: PipelineOptions) -> Path:
     if Ranks.from_environment().size > 1:
         raise ValueError("several processes train stage by stage: python -m cotap.train base, then distill")
     run_dir = Path(options.run_dir) if options.run_dir else _new_run_dir("cotap")
-    walking = _part(options, run_dir / "base", "base", options.base_iterations, [])
-    total = options.base_iterations + options.robust_iterations
-    base = _part(options, run_dir / "robust", "base", total, ["--recipe", "robust", "--resume", str(walking)])
+    base = _part(options, run_dir / "base", "base", options.base_iterations, ["--robot", options.robot])
     _part(options, run_dir / "distill", "distill", options.distill_iterations, ["--base-checkpoint", str(base)])
     print(_summary(run_dir))
     return run_dir
@@ -412,7 +408,7 @@ def _summary(run_dir: Path) -> str:
     from cotap.agents.checkpoint import load_checkpoint
 
     lines = ["| run | iterations | samples | seconds | checkpoint |", "|---|---|---|---|---|"]
-    for part in ("base", "robust", "distill"):
+    for part in STAGES:
         path = _newest(run_dir / part)
         assert path, f"{run_dir / part} holds no checkpoint"
         content = load_checkpoint(path)

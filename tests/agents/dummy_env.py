@@ -1,6 +1,6 @@
-"""An environment without physics that offers all that agents ask of `H1Env`: two agents, each with a target of its own.
+"""An environment without physics that offers all that agents ask of `HumanoidEnv`: two agents, each with a target.
 
-Each world holds one number per action. Actions push those numbers about; each agent is paid for how close its own
+Each env holds one number per action. Actions push those numbers about; each agent is paid for how close its own
 share of the actions comes to its own target. Observations have scales and offsets far from 1 and 0, so that
 normalisers have work to do.
 """
@@ -27,7 +27,7 @@ TINY = {"hidden": (8, 8), "steps": 6, "epochs": 2, "mini_batches": 2, "precision
 
 
 class DummyEnv(VecEnv):
-    """N worlds. `on_step`, where given, is called with the number of steps taken so far, before each step."""
+    """N envs. `on_step`, where given, is called with the number of steps taken so far, before each step."""
 
     reward_groups = ("lower", "upper")
 
@@ -44,7 +44,6 @@ class DummyEnv(VecEnv):
         self.rng = torch.Generator().manual_seed(seed)
         self.samples = 0
         self.steps = 0
-        self.level = 0.0
         self.robot = robot
         self.episode_length_buf = torch.zeros(num_envs, dtype=torch.long)
         self.x = torch.zeros(num_envs, self.num_actions)
@@ -61,7 +60,6 @@ class DummyEnv(VecEnv):
             self.on_step(self.steps)
         self.steps += 1
         self.samples += self.num_envs
-        self.level += 0.01 * float(self.x[0, 0].abs())
         self.episode_length_buf += 1
         noise = torch.randn(self.x.shape, generator=self.rng)
         self.x = 0.9 * self.x + 0.1 * actions + 0.3 * noise
@@ -82,7 +80,6 @@ class DummyEnv(VecEnv):
             "x": self.x.clone(),
             "episode_length": self.episode_length_buf.clone(),
             "steps": self.steps,
-            "level": self.level,
             "samples": self.samples,
             "rng": self.rng.get_state(),
             "ballast": torch.zeros(20_000),  # as a simulator's state, larger than tiny networks
@@ -91,15 +88,9 @@ class DummyEnv(VecEnv):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.x = state["x"].clone()
         self.episode_length_buf = state["episode_length"].clone()
-        self.steps, self.level, self.samples = state["steps"], state["level"], state["samples"]
+        self.steps, self.samples = state["steps"], state["samples"]
         self.rng.set_state(state["rng"])
         self._observe()
-
-    def progress(self) -> dict[str, float]:
-        return {"level": self.level}
-
-    def load_progress(self, progress: dict[str, float]) -> None:
-        self.level = progress["level"]
 
     def _observe(self) -> None:
         policy = torch.cat((5.0 + 3.0 * self.x, torch.ones(self.num_envs, 1)), 1)

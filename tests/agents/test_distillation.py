@@ -14,9 +14,7 @@ from torch.distributions import Independent, Normal, kl_divergence
 from cotap.agents.actors import DualActorCritic
 from cotap.agents.distillation import DistillationConfig, Guide
 from cotap.agents.dual_ppo import DualPPO, DualPPOConfig
-from cotap.agents.heads import SymmetricHead
 from cotap.agents.runner import layout_of
-from cotap.reflection import Reflection
 
 
 def base_policy(seed: int = 5) -> DualActorCritic:
@@ -136,25 +134,3 @@ def test_guidance_goes_on_where_it_stopped():
 def test_bad_fields_are_named(field, value):
     with pytest.raises(ValueError, match=rf"distillation\.{field}"):
         Guide(base_policy(), DistillationConfig(**{field: value}))
-
-
-def test_a_distilled_policy_begins_with_less_of_what_nobody_guides():
-    base, model = base_policy(), base_policy(seed=6)
-    guided_agent, free_agent = AGENTS
-    Guide(base, DistillationConfig(agents=("lower",), free_start=0.25)).start(model)
-    x = {name: torch.randn(5, width) for name, width in base.layout.observation_widths.items()}
-    of_base, started = base(x), model(x)
-    assert of_base.abs().max() > 0.01
-    torch.testing.assert_close(started[:, SLICES[guided_agent]], of_base[:, SLICES[guided_agent]])
-    torch.testing.assert_close(started[:, SLICES[free_agent]], 0.25 * of_base[:, SLICES[free_agent]])
-
-
-def test_a_symmetric_networks_output_can_be_scaled():
-    torch.manual_seed(0)
-    swap = Reflection(torch.tensor([1, 0]), torch.tensor([1.0, -1.0]))
-    head, x = SymmetricHead(swap, swap, (6, 4), 1.0), torch.randn(7, 2)
-    with torch.no_grad():
-        head.output_bias.uniform_(-1.0, 1.0)
-        before = head(x)
-        head.scale_output(0.3)
-        torch.testing.assert_close(head(x), 0.3 * before)

@@ -126,13 +126,13 @@ def test_advantages_of_three_steps_by_hand():
 
 
 def test_advantages_agree_with_their_definition_as_a_sum(rng):
-    steps, worlds, agents, gamma, lam = 9, 4, 2, 0.9, 0.8
-    rewards, values = draw(rng, steps, worlds, agents), draw(rng, steps, worlds, agents)
-    last = draw(rng, worlds, agents)
-    dones = torch.rand(steps, worlds, 1, generator=rng) < 0.25
+    steps, envs, agents, gamma, lam = 9, 4, 2, 0.9, 0.8
+    rewards, values = draw(rng, steps, envs, agents), draw(rng, steps, envs, agents)
+    last = draw(rng, envs, agents)
+    dones = torch.rand(steps, envs, 1, generator=rng) < 0.25
     result = generalized_advantages(rewards, values, last, dones, gamma, lam)
     assert bool(dones.any())
-    for w in range(worlds):
+    for w in range(envs):
         for a in range(agents):
             for t in range(steps):
                 total = 0.0

@@ -14,19 +14,21 @@ from cotap.agents.actors import DualActorCritic, Observations, as_dict
 from cotap.agents.checkpoint import CheckpointError
 from cotap.agents.refit import columns, take_over
 from cotap.agents.runner import layout_of
-from cotap.envs import H1Env
+from cotap.envs import HumanoidEnv
 from cotap.envs.observations import NoiseConfig, ObservationConfig
 
 HISTORY, TORQUES, GOALS = 5, 8, 10
-MakeEnv = Callable[..., H1Env]
+STEP = 86
+"""Width of one step of the observation."""
+MakeEnv = Callable[..., HumanoidEnv]
 
 
-def observations(env: H1Env, seed: int) -> Observations:
+def observations(env: HumanoidEnv, seed: int) -> Observations:
     rng = torch.Generator().manual_seed(seed)
     return {k: 1.0 + torch.randn(v.shape, generator=rng) for k, v in as_dict(env.get_observations()).items()}
 
 
-def trained(env: H1Env, symmetric: bool) -> DualActorCritic:
+def trained(env: HumanoidEnv, symmetric: bool) -> DualActorCritic:
     """Networks with weights and statistics of their own."""
     torch.manual_seed(3)
     model = DualActorCritic(layout_of(env, symmetric), (16, 8), 0.4)
@@ -36,7 +38,7 @@ def trained(env: H1Env, symmetric: bool) -> DualActorCritic:
     return model.eval()
 
 
-def content(env: H1Env, model: DualActorCritic) -> dict[str, Any]:
+def content(env: HumanoidEnv, model: DualActorCritic) -> dict[str, Any]:
     return {"layout": json.loads(json.dumps(env.layout())), "model": model.state_dict()}
 
 
@@ -45,7 +47,7 @@ def mean(model: DualActorCritic) -> torch.Tensor:
     return cast(EmpiricalNormalization, model.normalizers["policy"]).mean
 
 
-def fresh(env: H1Env, symmetric: bool) -> DualActorCritic:
+def fresh(env: HumanoidEnv, symmetric: bool) -> DualActorCritic:
     torch.manual_seed(4)
     return DualActorCritic(layout_of(env, symmetric), (16, 8), 1.0)
 
@@ -57,14 +59,16 @@ def values(model: DualActorCritic, x: Observations) -> torch.Tensor:
 
 @pytest.mark.parametrize("symmetric", [True, False])
 @pytest.mark.parametrize("noise", [False, True])
-def test_what_is_new_is_ignored_at_first(make_env: MakeEnv, symmetric: bool, noise: bool):
+@pytest.mark.parametrize("critic", ["present", "history"])
+def test_what_is_new_is_ignored_at_first(make_env: MakeEnv, symmetric: bool, noise: bool, critic: str):
     noisy = NoiseConfig(enabled=noise)
-    before = make_env(observations=ObservationConfig(noise=noisy))
-    now = make_env(observations=ObservationConfig(goals=True, noise=noisy))
+    before = make_env(observations=ObservationConfig(noise=noisy, critic=critic))
+    now = make_env(observations=ObservationConfig(goals=True, noise=noisy, critic=critic))
     old, new = trained(before, symmetric), fresh(now, symmetric)
     assert take_over("c.pt", content(before, old), new, now, other_terms=True)
     x = observations(now, 2)
-    without = {k: v if k == "privileged" else v[:, : -HISTORY * GOALS] for k, v in x.items()}
+    new_columns = {"privileged": 0, "present": GOALS, "policy": HISTORY * GOALS, "clean": HISTORY * GOALS}
+    without = {k: v[:, : v.shape[1] - new_columns[k]] for k, v in x.items()}
     torch.testing.assert_close(new.eval()(x), old(without))
     torch.testing.assert_close(values(new, x), values(old, without))
     assert float(old(without).detach().std()) > 0.1
@@ -87,36 +91,42 @@ def test_what_has_gone_counts_as_at_its_mean(make_env: MakeEnv, symmetric: bool)
     assert (expected - old(x)).abs().max() > 0.1
 
 
-def test_critics_keep_the_weights_of_what_they_alone_still_see(make_env: MakeEnv):
-    before, now = make_env(), make_env(observations=ObservationConfig(arm_torque="critic"))
+@pytest.mark.parametrize(("critic", "steps"), [("present", 1), ("history", HISTORY)])
+def test_critics_keep_the_weights_of_what_they_alone_still_see(make_env: MakeEnv, critic: str, steps: int):
+    before = make_env(observations=ObservationConfig(critic=critic))
+    now = make_env(observations=ObservationConfig(arm_torque="critic", critic=critic))
     old, new = trained(before, True), fresh(now, True)
     take_over("c.pt", content(before, old), new, now, other_terms=True)
-    seen = before.get_observations()["policy"].shape[1]
-    kept = seen - HISTORY * TORQUES
+    seen, kept = STEP * steps, (STEP - TORQUES) * steps
     was, has = (m.state_dict()["critics.upper.weights.0"] for m in (old, new))
-    newest = was[:, kept:seen].reshape(-1, HISTORY, TORQUES)[:, -1]
+    newest = was[:, kept:seen].reshape(-1, steps, TORQUES)[:, -1]
     # Orientation and velocity come before the torques.
     assert torch.equal(has, torch.cat((was[:, :kept], was[:, seen : seen + 7], newest, was[:, seen + 7 :]), 1))
 
 
-@pytest.mark.parametrize("noise", [False, True])
-def test_critics_keep_the_statistics_of_what_they_alone_still_see(make_env: MakeEnv, noise: bool):
+@pytest.mark.parametrize(
+    ("noise", "critic", "source"),
+    [(False, "present", "present"), (False, "history", "policy"), (True, "present", "present"),
+     (True, "history", "clean")],
+)  # fmt: skip
+def test_critics_keep_the_statistics_of_what_they_alone_still_see(
+    make_env: MakeEnv, noise: bool, critic: str, source: str
+):
     """Else weights that were learned on numbers of the order of one would meet others."""
     noisy = NoiseConfig(enabled=noise)
-    before = make_env(observations=ObservationConfig(noise=noisy))
-    now = make_env(observations=ObservationConfig(arm_torque="critic", noise=noisy))
+    before = make_env(observations=ObservationConfig(noise=noisy, critic=critic))
+    now = make_env(observations=ObservationConfig(arm_torque="critic", noise=noisy, critic=critic))
     old, new = trained(before, True), fresh(now, True)
     take_over("c.pt", content(before, old), new, now, other_terms=True)
     was, has = old.state_dict(), new.state_dict()
     for key in ("_mean", "_std", "_var"):
         mine = has[f"normalizers.privileged.{key}"][:, 7 : 7 + TORQUES]
-        source = "clean" if noise else "policy"
         assert torch.equal(mine, was[f"normalizers.{source}.{key}"][:, -TORQUES:])
         rest = has[f"normalizers.privileged.{key}"][:, [*range(7), *range(7 + TORQUES, 7 + TORQUES + 6)]]
         assert torch.equal(rest, was[f"normalizers.privileged.{key}"])
 
 
-def test_statistics_of_what_is_new_are_those_of_the_worlds(make_env: MakeEnv):
+def test_statistics_of_what_is_new_are_those_of_the_envs(make_env: MakeEnv):
     before, now = make_env(), make_env(64, observations=ObservationConfig(goals=True))
     new = fresh(now, True)
     take_over("c.pt", content(before, trained(before, True)), new, now, other_terms=True)
@@ -130,6 +140,7 @@ def test_columns_run_term_by_term_and_oldest_first():
     assert columns(layout) == {
         "policy": [("a", 2), ("a", 3), ("a", 0), ("a", 1), ("b", 1), ("b", 0)],
         "clean": [("a", 2), ("a", 3), ("a", 0), ("a", 1), ("b", 1), ("b", 0)],
+        "present": [("a", 0), ("a", 1), ("b", 0)],
         "privileged": [("c", 0), ("c", 1)],
     }
 

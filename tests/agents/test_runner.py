@@ -21,26 +21,26 @@ from cotap.agents.checkpoint import CheckpointError, load_checkpoint, save_check
 from cotap.agents.losses import LOWEST_RATE
 from cotap.agents.runner import DualRunner, TrainingFault, check_run_dir, sole_writer
 from cotap.agents.runner_config import RunnerConfig
-from cotap.envs import H1Env, H1EnvConfig
+from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.observations import NoiseConfig, ObservationConfig
 from cotap.envs.terminations import TerminationConfig
 
 STEPS = dummy_env.TINY["steps"]
-WORLDS = 8
+ENVS = 8
 
 
 def dummy() -> DummyEnv:
-    return DummyEnv(WORLDS)
+    return DummyEnv(ENVS)
 
 
-def robots(num_envs: int = WORLDS, goals: bool = False) -> H1Env:
+def robots(num_envs: int = ENVS) -> HumanoidEnv:
     """Episodes so short that resets of every kind happen in a few iterations."""
-    return H1Env(
-        H1EnvConfig(
+    return HumanoidEnv(
+        HumanoidEnvConfig(
             num_envs=num_envs,
             num_threads=1,
             terminations=TerminationConfig(episode_s=0.3),
-            observations=ObservationConfig(noise=NoiseConfig(enabled=True), goals=goals),
+            observations=ObservationConfig(noise=NoiseConfig(enabled=True)),
         )
     )
 
@@ -84,20 +84,18 @@ def weights(runner: DualRunner) -> dict[str, torch.Tensor]:
     return {k: v.clone() for k, v in runner.alg.model.state_dict().items()}
 
 
-@pytest.mark.parametrize("make_world", [dummy, robots])
+@pytest.mark.parametrize("make", [dummy, robots])
 @pytest.mark.parametrize("stop", [1, 3])
-def test_resumed_run_ends_bit_for_bit_where_a_straight_one_does(
-    tmp_path: Path, make_world: Callable[[], Any], stop: int
-):
-    straight = make_runner(tmp_path / "straight", 5, env=make_world())
+def test_resumed_run_ends_bit_for_bit_where_a_straight_one_does(tmp_path: Path, make: Callable[[], Any], stop: int):
+    straight = make_runner(tmp_path / "straight", 5, env=make())
     start = weights(straight)
     straight.learn(init_at_random_ep_len=True)
-    make_runner(tmp_path / "parts", stop, env=make_world()).learn(init_at_random_ep_len=True)
+    make_runner(tmp_path / "parts", stop, env=make()).learn(init_at_random_ep_len=True)
     # Another seed: everything must come from the file.
-    resumed = make_runner(tmp_path / "parts", 5, seed=99, env=make_world())
+    resumed = make_runner(tmp_path / "parts", 5, seed=99, env=make())
     resumed.load(str(checkpoint(tmp_path / "parts", stop)))
     assert resumed.current_learning_iteration == stop
-    assert resumed.env.samples == stop * STEPS * WORLDS
+    assert resumed.env.samples == stop * STEPS * ENVS
     resumed.learn(init_at_random_ep_len=True)
     assert_same_run(checkpoint(tmp_path / "straight", 5), checkpoint(tmp_path / "parts", 5))
     assert any(not torch.equal(v, start[k]) for k, v in weights(resumed).items())
@@ -114,14 +112,14 @@ def test_checkpoints_come_at_intervals_and_at_the_end(tmp_path: Path):
     expected = [f"checkpoint_{i:06d}.pt" for i in (2, 4, 5)]
     assert names(tmp_path) == [*expected, "config.json"]
     assert [load_checkpoint(tmp_path / n)["iteration"] for n in expected] == [2, 4, 5]
-    assert [load_checkpoint(tmp_path / n)["samples"] for n in expected] == [i * STEPS * WORLDS for i in (2, 4, 5)]
+    assert [load_checkpoint(tmp_path / n)["samples"] for n in expected] == [i * STEPS * ENVS for i in (2, 4, 5)]
 
 
 def test_only_the_newest_checkpoint_keeps_simulator_states(tmp_path: Path):
     make_runner(tmp_path, 6, save_interval=2).learn()
     older = [load_checkpoint(checkpoint(tmp_path, i)) for i in (2, 4)]
     newest = load_checkpoint(checkpoint(tmp_path, 6))
-    assert newest["env"]["episode_length"].shape == (WORLDS,)
+    assert newest["env"]["episode_length"].shape == (ENVS,)
     for content in older:
         assert content["env"] == {}
         assert content["learner"]["optimizers"].keys() == {"lower", "upper"}
@@ -130,29 +128,29 @@ def test_only_the_newest_checkpoint_keeps_simulator_states(tmp_path: Path):
         )
 
 
-def test_an_older_checkpoint_goes_on_with_fresh_worlds(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_an_older_checkpoint_goes_on_with_fresh_envs(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     make_runner(tmp_path / "a", 4, save_interval=2).learn()
     runner = make_runner(tmp_path / "b", 3)
     runner.load(str(checkpoint(tmp_path / "a", 2)))
     assert "no simulator states" in "".join(capsys.readouterr())
-    assert runner.env.samples == 2 * STEPS * WORLDS
+    assert runner.env.samples == 2 * STEPS * ENVS
     runner.learn()
     assert names(tmp_path / "b") == ["checkpoint_000003.pt", "config.json"]
 
 
-def test_another_number_of_worlds_goes_on_with_fresh_ones(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_another_number_of_envs_goes_on_with_fresh_ones(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     make_runner(tmp_path / "a", 2).learn()
     runner = make_runner(tmp_path / "b", 3, env=DummyEnv(16))
     runner.load(str(checkpoint(tmp_path / "a", 2)))
     assert "no simulator states" in "".join(capsys.readouterr())
     runner.learn()
     content = load_checkpoint(checkpoint(tmp_path / "b", 3))
-    assert content["samples"] == 2 * STEPS * WORLDS + STEPS * 16
+    assert content["samples"] == 2 * STEPS * ENVS + STEPS * 16
     assert content["iteration"] == 3
 
 
 @pytest.mark.parametrize(("collision", "fresh"), [("feet", False), ("full", True)])
-def test_worlds_of_another_model_start_afresh(tmp_path: Path, collision: str, fresh: bool, capsys: Any):
+def test_envs_of_another_model_start_afresh(tmp_path: Path, collision: str, fresh: bool, capsys: Any):
     def configured(folder: Path, iterations: int, shapes: str) -> DualRunner:
         runner = make_runner(folder, iterations)
         runner.config = {"stage": "base", "training": {"env": {"collision": shapes}}}
@@ -163,58 +161,16 @@ def test_worlds_of_another_model_start_afresh(tmp_path: Path, collision: str, fr
     assert ("no simulator states" in "".join(capsys.readouterr())) == fresh
 
 
-@pytest.mark.parametrize("why", ["older", "another number", "not saved", "refitted"])
-def test_curricula_go_on_in_fresh_worlds(tmp_path: Path, why: str, capsys: pytest.CaptureFixture[str]):
-    """The gantry's share, and the mean of what each world has come to."""
+def test_samples_go_on_in_fresh_envs_and_with_them_the_curricula(tmp_path: Path):
     env = robots()
-    env.assistance.left = 0.25
-    env.hand_forces.scale = torch.linspace(0.0, 0.7, WORLDS)
-    env.blows.scale[:2] = 1.0
     runner = make_runner(tmp_path, 1, env=env)
-    runner.runner_cfg.save_worlds = why != "not saved"
-    for iteration in (1, 2):
-        runner.current_learning_iteration = iteration
-        runner.save()
-    other = robots(3 if why == "another number" else WORLDS, goals=why == "refitted")
-    path = checkpoint(tmp_path, 1 if why == "older" else 2)
-    make_runner(tmp_path / "b", 1, env=other).load(str(path), other_terms=why == "refitted")
-    assert other.assistance.left == 0.25
-    torch.testing.assert_close(other.hand_forces.scale, torch.full((other.num_envs,), 0.35))
-    torch.testing.assert_close(other.blows.scale, torch.full((other.num_envs,), (2.0 + 0.2 * 6) / 8))
-    assert "and curricula" not in "".join(capsys.readouterr())
-
-
-def test_a_checkpoint_from_before_curricula_were_kept_starts_them_afresh(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
-    make_runner(tmp_path, 1).learn()
-    content = load_checkpoint(checkpoint(tmp_path, 1))
-    assert content.pop("progress")["level"] > 0.0
-    save_checkpoint(tmp_path / "old.pt", content)
-    runner = make_runner(tmp_path / "b", 1, env=DummyEnv(16))
-    runner.load(str(tmp_path / "old.pt"))
-    assert "no simulator states and curricula" in "".join(capsys.readouterr())
-    assert runner.env.progress() == {"level": 0.0}
-    make_runner(tmp_path / "c", 1).load(str(tmp_path / "old.pt"))
-    assert "and curricula" not in "".join(capsys.readouterr())
-
-
-@pytest.mark.parametrize(
-    ("progress", "message"),
-    [
-        (3, "no usable part 'progress': 3"),
-        ({"assistance": 0.5}, "progress must be of assistance, hand_forces, blows, got assistance"),
-        ({"assistance": 0.5, "hand_forces": 1.5, "blows": 0.0}, r"hand_forces must lie in \[0.0, 1.0\], got 1.5"),
-        ({"assistance": 0.5, "hand_forces": 1.0, "blows": "x"}, "blows must be a finite number, got 'x'"),
-    ],
-)
-def test_progress_that_is_none_is_refused(tmp_path: Path, progress: Any, message: str):
-    runner = make_runner(tmp_path, 1, env=robots())
+    env.samples = 7_000_000
+    runner.runner_cfg.save_envs = False
     runner.save()
-    content = load_checkpoint(checkpoint(tmp_path, 0))
-    save_checkpoint(tmp_path / "odd.pt", content | {"env": {}, "progress": progress})
-    with pytest.raises(CheckpointError, match=message):
-        runner.load(str(tmp_path / "odd.pt"))
+    assert load_checkpoint(checkpoint(tmp_path, 0))["env"] == {}
+    other = robots(3)
+    make_runner(tmp_path / "b", 1, env=other).load(str(checkpoint(tmp_path, 0)))
+    assert other.samples == 7_000_000
 
 
 def test_a_checkpoint_of_weights_alone_starts_a_new_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -339,19 +295,19 @@ def test_logs_of_a_resumed_run_are_one_curve(tmp_path: Path):
     assert {"lower/target", "upper/target", "agents/lower/kl", "agents/upper/action_std"} <= set(tags)
     assert "throughput/steps_per_s" in tags
     for tag in tags:
-        assert [e.step for e in logs.Scalars(tag)] == [STEPS * WORLDS * i for i in (1, 2, 3, 4, 5)], tag
+        assert [e.step for e in logs.Scalars(tag)] == [STEPS * ENVS * i for i in (1, 2, 3, 4, 5)], tag
 
 
-@pytest.mark.parametrize("worlds", [4, 16])
-def test_logs_count_samples_also_when_the_number_of_worlds_changes(tmp_path: Path, worlds: int):
+@pytest.mark.parametrize("envs", [4, 16])
+def test_logs_count_samples_also_when_the_number_of_envs_changes(tmp_path: Path, envs: int):
     make_runner(tmp_path, 3).learn()
-    runner = make_runner(tmp_path, 5, env=DummyEnv(worlds))
+    runner = make_runner(tmp_path, 5, env=DummyEnv(envs))
     runner.load(str(checkpoint(tmp_path, 3)))
     runner.learn()
     logs = EventAccumulator(str(tmp_path))
     logs.Reload()
-    before = 3 * WORLDS
-    expected = [STEPS * n for n in (WORLDS, 2 * WORLDS, before, before + worlds, before + 2 * worlds)]
+    before = 3 * ENVS
+    expected = [STEPS * n for n in (ENVS, 2 * ENVS, before, before + envs, before + 2 * envs)]
     assert [e.step for e in logs.Scalars("lower/target")] == expected
 
 
@@ -501,25 +457,25 @@ def test_a_reward_that_is_no_number_teaches_its_agent_nothing_and_is_counted(
 
 @pytest.mark.usefixtures("in_tmp_path")
 @pytest.mark.parametrize("fault", ["nan", "force"])
-def test_a_world_that_diverges_is_named_counted_and_contained(
+def test_a_env_that_diverges_is_named_counted_and_contained(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, fault: str
 ):
     env = robots()
-    forces, calls = env._apply_forces, []
+    apply, calls = env.forces.apply, []
 
-    def planted() -> None:
-        forces()
+    def planted(xfrc: torch.Tensor, *args: Any) -> None:
+        apply(xfrc, *args)
         calls.append(1)
         if len(calls) == STEPS + 2:
             if fault == "nan":
                 env.sim.qpos[3, 10] = math.nan
             else:
-                env.sim.xfrc[3, 1, 2] = 1e12
+                xfrc[3, 1, 2] = 1e12
 
-    monkeypatch.setattr(env, "_apply_forces", planted)
+    monkeypatch.setattr(env.forces, "apply", planted)
     runner = make_runner(tmp_path, 3, env=env)
     runner.learn()
-    assert "iteration 2: worlds diverged 1 times" in "".join(capsys.readouterr())
+    assert "iteration 2: envs diverged 1 times" in "".join(capsys.readouterr())
     assert env.num_diverged == 1
     content = load_checkpoint(checkpoint(tmp_path, 3))
     for part in (content["model"], content["env"]["observations"]):
@@ -545,7 +501,7 @@ def test_a_checkpoint_of_another_robot_is_refused_and_changes_nothing(tmp_path: 
 
 def test_a_checkpoint_of_another_observation_layout_is_refused(tmp_path: Path):
     make_runner(tmp_path, 1, env=robots()).learn()
-    other = H1Env(H1EnvConfig(num_envs=WORLDS, num_threads=1, observations=ObservationConfig(history=3)))
+    other = HumanoidEnv(HumanoidEnvConfig(num_envs=ENVS, num_threads=1, observations=ObservationConfig(history=3)))
     with pytest.raises(CheckpointError, match="another history: 5, here 3"):
         make_runner(tmp_path / "b", 1, env=other).load(str(checkpoint(tmp_path, 1)))
 

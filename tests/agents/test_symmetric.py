@@ -10,13 +10,14 @@ from typing import Any
 import pytest
 import torch
 from dummy_env import TINY, DummyEnv
+from random_policy import save_random_policy
 
 from cotap.agents.actors import AgentLayout, DualActorCritic, Observations
 from cotap.agents.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
 from cotap.agents.dual_ppo import DualPPO, DualPPOConfig
 from cotap.agents.heads import Head, SymmetricHead
 from cotap.agents.runner import layout_of
-from cotap.evaluation.policy import load_policy, shipped_checkpoint
+from cotap.evaluation.policy import load_policy
 from cotap.reflection import Reflection, Symmetry, join
 
 SWAP = Reflection(torch.tensor([1, 0, 2]), torch.tensor([1.0, 1.0, -1.0]))
@@ -136,9 +137,9 @@ def test_columns_that_are_no_mirror_images_are_refused(columns: list[list[int]])
 
 
 def test_a_checkpoint_with_a_broken_symmetry_is_refused(tmp_path: Path):
-    content = load_checkpoint(shipped_checkpoint())
+    content = load_checkpoint(save_random_policy(tmp_path / "policy.pt"))
     content["agents"]["symmetry"]["actions"] = [[5, 0], [1, 1]]
     path = tmp_path / "broken.pt"
-    save_checkpoint(path, {k: v for k, v in content.items() if k not in ("format", "version")})
+    save_checkpoint(path, content)
     with pytest.raises(CheckpointError, match=r"broken\.pt.*mirror images"):
         load_policy(path)

@@ -61,7 +61,10 @@ def test_gravity_torque_in_double_precision_to_a_millionth(spec, model):
     )  # fmt: skip
     zero = torch.zeros(2, 4, 3, 3, dtype=torch.float64)
     links = LinkInertias(
-        exact([[b.mass_kg for b in c] for c in chains]), exact([[b.com for b in c] for c in chains]), zero
+        exact([[b.mass_kg for b in c] for c in chains]),
+        exact([[b.com for b in c] for c in chains]),
+        zero,
+        zero[..., 0, 0],
     )
     q, quat = random_states(spec, 20, seed=1)
     pose = arms.pose(exact(q).unflatten(1, (2, 4)))

@@ -51,12 +51,6 @@ def leaves(config: Any) -> list[Any]:
 
 
 @pytest.mark.parametrize("recipe", BASE_RECIPES)
-def test_every_recipe_survives_json(recipe: str):
-    training = BASE_RECIPES[recipe]()
-    assert from_plain(BaseTraining, json.loads(json.dumps(to_plain(training), allow_nan=False))) == training
-
-
-@pytest.mark.parametrize("recipe", BASE_RECIPES)
 def test_every_field_of_every_recipe_survives_json(recipe: str):
     training = BASE_RECIPES[recipe]()
     changed = change_all(training)
@@ -71,15 +65,11 @@ def test_every_field_of_every_recipe_survives_json(recipe: str):
 @pytest.mark.parametrize("recipe", BASE_RECIPES)
 def test_recipes_are_fresh_and_valid(recipe: str):
     one, other = BASE_RECIPES[recipe](), BASE_RECIPES[recipe]()
-    one.env.commands.gait_period_s = 99.0
+    one.env.gait.period_s = 99.0
     one.ppo.hidden = (1,)
     assert other == BASE_RECIPES[recipe]()
     for part in (other.env, other.ppo, other.runner):
         part.check()
-
-
-def test_paper_recipe_has_the_papers_networks():
-    assert BASE_RECIPES["paper"]().ppo.hidden == (512, 256, 128)
 
 
 def test_plain_data_is_dicts_and_lists():

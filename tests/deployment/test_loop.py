@@ -18,12 +18,13 @@ from cotap.deployment.engines import EngineConfig, make_engine
 from cotap.deployment.joint_law import JointLaw, damped_law, pd_law
 from cotap.deployment.keyboard import Stick
 from cotap.deployment.metadata import PolicyError
+from cotap.deployment.policy import OnnxPolicy
 from cotap.deployment.robot import Perturbations, Robot
 from cotap.deployment.safety import SafetyConfig, Watchdog
 from cotap.deployment.scenario import ArmMotion, Scenario, TimedCommand, load_scenario
 from cotap.deployment.trial import Trial, run_trial, start_up, trajectory
 from cotap.envs.commands import CommandConfig
-from cotap.envs.forces import ForceProfile
+from cotap.envs.scripted_forces import ForceProfile
 from cotap.envs.upper_body import UpperBodyConfig
 
 FAST = EngineConfig(timestep=0.01, collision="feet", cone="pyramidal")
@@ -36,65 +37,7 @@ def make_robot(spec, perturbations: Perturbations | None = None) -> Robot:
 
 def make_controller(policy, spec, laws: UpperBodyConfig | None = None, seed: int = 0) -> Controller:
     motion = ArmMotion().reference(spec, 0.02)
-    return Controller(policy, spec, laws or UpperBodyConfig(), CommandConfig(steady_rad=0.2), motion, seed)
-
-
-def test_a_controller_corrects_jumps_of_the_clock_for_as_long_as_it_was_trained_to(policy, spec):
-    commands = CommandConfig(step_timing=True, step_correct_s=0.1)
-    controller = Controller(policy, spec, UpperBodyConfig(), commands, ArmMotion().reference(spec, 0.02), seed=0)
-    assert controller._timing is not None
-    assert controller._timing._correct_s == 0.1
-
-
-@pytest.mark.parametrize("falls", [True, False])
-def test_a_controller_steps_where_a_fall_is_foreseen(policy, spec, falls, monkeypatch):
-    """From what its sensors read alone: all else of the state is NaN."""
-    commands = CommandConfig(foresee_falls=True, stand_probability=1.0)
-    motion = ArmMotion().reference(spec, 0.02)
-    controller = Controller(policy, spec, UpperBodyConfig(), commands, motion, seed=0)
-    robot = make_robot(spec)
-    start_up(robot, controller, SafetyConfig(ramp_s=0.0), 0)
-    felt, foresight = [], controller._foresight
-    assert foresight is not None
-    real = foresight.falling
-    monkeypatch.setattr(foresight, "falling", lambda s, c: felt.append(real(s, c)) or torch.tensor([falls]))
-    controller.step(robot.read())
-    controller.step(robot.read())
-    assert felt
-    assert not any(f.any() for f in felt)  # it stands, and well
-    assert (controller.commands.current().stand[0] < 0.5) == falls
-
-
-def test_a_controller_leans_by_what_its_sensors_read_and_starts_anew(policy, spec):
-    commands = CommandConfig(lean_into_loads=True, stand_probability=1.0)
-    controller = Controller(policy, spec, UpperBodyConfig(), commands, ArmMotion().reference(spec, 0.02), seed=0)
-    robot = make_robot(spec)
-    start_up(robot, controller, SafetyConfig(ramp_s=0.0), 0)
-    sense = controller._load_sense
-    assert sense is not None
-    for _ in range(3):
-        robot.act(controller.step(robot.read()), FREE)
-    assert sense.tilt.isfinite().all()
-    assert sense.tilt.norm() > 0.0
-    controller.restart()
-    assert sense.tilt.norm() == 0.0
-    assert sense._fresh.all()
-
-
-@pytest.mark.parametrize("braces", [False, True])
-def test_a_controller_braces_itself_against_what_pulls(policy, spec, braces, monkeypatch):
-    commands = CommandConfig(lean_into_loads=True, brace_tilt_rad=0.03)
-    controller = Controller(policy, spec, UpperBodyConfig(), commands, ArmMotion().reference(spec, 0.02), seed=0)
-    controller.commands.override(torch.tensor([[0.5, 0.0]]), torch.zeros(1), torch.zeros(1), torch.ones(1))
-    robot = make_robot(spec)
-    start_up(robot, controller, SafetyConfig(ramp_s=0.0), 0)
-    sense = controller._load_sense
-    assert sense is not None
-    assert sense._brace_rad == 0.03
-    monkeypatch.setattr(sense, "step", lambda *_: setattr(sense, "braces", torch.tensor([braces])))
-    for _ in range(11):  # the first fills the history
-        robot.act(controller.step(robot.read()), FREE)
-    assert float(controller.commands.current().velocity_h[0, 0]) == pytest.approx(0.0 if braces else 0.3, abs=1e-5)
+    return Controller(policy, spec, laws or UpperBodyConfig(), CommandConfig(), motion, seed)
 
 
 @pytest.fixture
@@ -169,7 +112,7 @@ def test_laws_are_late_by_the_delay_but_a_stop_is_not(spec, default):
     assert robot.torque()[0] == 0.0
 
 
-def test_readings_are_lost_and_noisy_as_told(spec, default):
+def test_readings_are_lost_and_noisy_as_configured(spec, default):
     robot = make_robot(spec, Perturbations(drop=0.3, encoder_noise=0.01, velocity_noise=0.5))
     robot.start(default, 0)
     robot.engine.hold(True)
@@ -233,13 +176,13 @@ def test_the_watchdog_names_what_it_stops_for(spec, default):
 
 def test_a_policy_that_breaks_is_stopped_damped_and_counted(policy, spec):
     class Broken:
-        metadata = policy.metadata
+        metadata, offset, action = policy.metadata, policy.offset, policy.action
         calls = 0
 
         def __call__(self, observation):
             self.calls += 1
-            targets, action = policy(observation)
-            return (targets * np.nan if self.calls > 10 else targets), action
+            targets = policy(observation)
+            return targets * np.nan if self.calls > 10 else targets
 
     robot, controller = make_robot(spec), make_controller(Broken(), spec)
     command = TimedCommand(stand=True)
@@ -273,21 +216,50 @@ def test_an_encoder_that_breaks_stops_the_robot_under_every_law(policy, spec, mo
     assert np.isfinite(np.stack(trial.qpos)).all()
 
 
-def test_it_walks_where_it_is_told_and_feels_the_forces(policy, spec):
-    scenario = Scenario(
-        4.0,
-        command=(TimedCommand(stand=True), TimedCommand(at=0.5, velocity=(0.6, 0.0))),
-        force=(ForceProfile((0.0, 0.0, -20.0), "left", 3.0),),
-    )
-    robot, controller = make_robot(spec), make_controller(policy, spec)
-    trial = run_trial(robot, controller, scenario, SafetyConfig())
+def test_it_feels_the_forces_and_meets_commands_at_their_times(policy, spec):
+    commands = (TimedCommand(stand=True), TimedCommand(at=0.1, velocity=(0.6, 0.0)))
+    hands = []
+    for force in ((), (ForceProfile((0.0, 0.0, -20.0), "left", 0.2),)):
+        scenario = Scenario(0.6, command=commands, force=force)
+        trial = run_trial(make_robot(spec), make_controller(policy, spec), scenario, SafetyConfig())
+        assert not trial.fell
+        t = trajectory([trial], 30)
+        assert t.stand[:5].all()
+        assert not t.stand[5:].any()
+        assert t.command[-1, 0].tolist() == pytest.approx([0.6, 0.0, 0.0])
+        hands.append(t.hand_offset[:, 0, :, 2])
+    moved = hands[1] - hands[0]
+    assert moved[:10].abs().max() == 0.0
+    assert moved[-1, 0] < -0.01 < 0.005 * moved[-1, 1].sign()
+
+
+@pytest.mark.slow
+def test_the_shipped_policy_walks_in_the_loop(shipped_file, spec):
+    policy = OnnxPolicy(shipped_file)
+    commands = (TimedCommand(stand=True), TimedCommand(at=0.5, velocity=(0.6, 0.0)))
+    trial = run_trial(make_robot(spec), make_controller(policy, spec), Scenario(4.0, command=commands), SafetyConfig())
     assert not trial.fell
-    t = trajectory([trial], 200)
-    assert t.velocity[100:, 0, 0].mean() == pytest.approx(0.6, abs=0.12)
-    assert t.command[-1, 0].tolist() == pytest.approx([0.6, 0.0, 0.0])
-    assert t.stand[:20].all()
-    before, after = (t.hand_error[k, 0, 0].mean() for k in (slice(100, 150), slice(170, 200)))
-    assert after > before + 0.005
+    assert trajectory([trial], 200).velocity[100:, 0, 0].mean() == pytest.approx(0.6, abs=0.12)
+
+
+@pytest.mark.parametrize(("field", "value"), [("max_tilt_rad", 0.01), ("min_height", 0.99)])
+def test_a_fall_is_what_the_policy_was_trained_to_call_one(field, value, policy, spec):
+    """The robot stands well; by a stricter limit it has fallen."""
+    terminations = policy.metadata.terminations | {field: value}
+
+    class Strict:
+        metadata = dataclasses.replace(policy.metadata, terminations=terminations)
+        offset, action = policy.offset, policy.action
+
+        def __call__(self, observation):
+            return policy(observation)
+
+    scenario = Scenario(0.4, command=(TimedCommand(stand=True),))
+    fell = [
+        run_trial(make_robot(spec), make_controller(p, spec), scenario, SafetyConfig(ramp_s=0.0)).fell
+        for p in (policy, Strict())
+    ]
+    assert fell == [False, True]
 
 
 def test_a_short_trial_is_padded_as_fallen(policy, spec):
@@ -356,6 +328,26 @@ def test_a_scenario_is_read_and_run(policy_file, tmp_path, spec, capsys):
     assert [t["touched_s"] for t in result["trials"]] == [{}, {}]
 
 
+@pytest.mark.parametrize("engine", ["mujoco", "pybullet"])
+def test_every_robot_is_deployed(robot, engine, random_policy, tmp_path):
+    if engine == "pybullet":
+        pytest.importorskip("pybullet")
+    out = tmp_path / "r.json"
+    arguments = [
+        "--policy",
+        str(random_policy(robot=robot)),
+        "--engine",
+        engine,
+        "--seconds",
+        "0.2",
+        "--json",
+        str(out),
+    ]
+    assert deploy(arguments) == 0
+    result = json.loads(out.read_text())
+    assert (result["num_trials"], result["num_falls"], result["stops"]) == (1, 0, {})
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -417,12 +409,11 @@ def _edited(policy_file, tmp_path, name, value):
         ("kp", [100.0] * 19, "other kp"),
         ("torque_limit_nm", [300.0] * 19, "other torque_limit_nm"),
         ("torque_limit_nm", [0.0] * 19, "other torque_limit_nm"),
-        ("joint_range_rad", [[-1.0, 1.0]] * 19, "other joint_range_rad"),
-        ("velocity_limit_rad_s", [20.0] * 19, "other velocity_limit_rad_s"),
         ("nominal_height_m", 5.0, "other nominal_height_m: 5.0, here"),
-        ("agents", {"lower": [0, 10], "upper": [10, 19]}, "other agents"),
         ("commands", {"gait": 1.0}, "no field 'gait'"),
-        ("law", {"left": {"name": "jelly"}, "right": {}, "ranges": None}, "'jelly' is unknown"),
+        ("gait", {"period_s": 0.0}, "gait.period_s must lie in"),
+        ("terminations", {"max_tilt_rad": "far"}, "max_tilt_rad must be of type float"),
+        ("law", {"left": {"name": "jelly"}}, "'jelly' is unknown"),
     ],
 )
 def test_policies_of_another_robot_are_refused(name, value, message, policy_file, tmp_path, capsys):
@@ -441,8 +432,6 @@ def test_the_trained_law_is_the_default(policy):
     other = law | {"singularity_ratio": False, "torso": law["torso"] | {"model": "constant"}}
     laws = law_config(dataclasses.replace(policy.metadata, law=other))
     assert (laws.singularity_ratio, laws.torso.model) == (False, "constant")
-    earlier = {name: law[name] for name in ("left", "right", "ranges")}
-    assert law_config(dataclasses.replace(policy.metadata, law=earlier)).singularity_ratio
     weaker = [0.5 * limit for limit in policy.metadata.torque_limit_nm]  # as `torque_limit_scale` makes them
     robot_of(dataclasses.replace(policy.metadata, torque_limit_nm=weaker))
     with pytest.raises(PolicyError, match="h2"):

@@ -1,6 +1,8 @@
-"""One world of the batched simulation against the deployment loop, at the same settings."""
+"""The environment against the deployed loop, at the same settings: one robot, base held, legs and arms in motion."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,11 +11,15 @@ import torch
 from cotap.agents.actors import as_dict
 from cotap.deployment.controller import Controller
 from cotap.deployment.engines import EngineConfig, make_engine
+from cotap.deployment.policy import OnnxPolicy
 from cotap.deployment.robot import Perturbations, Robot
-from cotap.deployment.scenario import ArmMotion
-from cotap.envs import H1Env
+from cotap.envs import HumanoidEnv
 from cotap.envs.upper_body import UpperBodyConfig
-from cotap.evaluation.policy import load_policy, shipped_checkpoint
+from cotap.evaluation.policy import load_policy
+from cotap.motions.reference import ReferenceMotion
+
+SECONDS = 2.0
+ENGINE = EngineConfig(timestep=0.01, collision="feet", cone="pyramidal")
 
 
 def laws_named(name: str) -> UpperBodyConfig:
@@ -27,61 +33,72 @@ def laws_named(name: str) -> UpperBodyConfig:
     return laws
 
 
-def batched(
-    laws: UpperBodyConfig, stand: float, seconds: float, leans: bool
-) -> tuple[H1Env, list[np.ndarray], list[np.ndarray], dict]:
-    """A held robot on a policy that walks in the air: its joints (T, J), torques (T, U), and how it began."""
-    policy = load_policy(shipped_checkpoint("base"))
-    cfg = policy.env_config
-    cfg.num_envs, cfg.num_threads, cfg.fixed_base, cfg.upper_body = 1, 1, True, laws
-    if not leans:
-        cfg.commands.lean_into_loads, cfg.commands.brace_tilt_rad = False, 0.0
-    cfg.collision = "feet"  # as the engine below: rounding grows where legs touch
-    cfg.assist.enabled = cfg.hand_forces.enabled = cfg.blows.enabled = cfg.randomization.enabled = False
-    cfg.motions.clips.only, cfg.motions.clips.share = ("punch",), 1.0
-    cfg.force.force, cfg.force.hand, cfg.force.start_s = (8.0, -5.0, -6.0), "both", 0.5
-    env = H1Env(cfg)
-    walk = 1.0 - stand
-    env.commands.override(
-        torch.tensor([[0.6, 0.2]]) * walk, torch.tensor([0.4]) * walk, torch.tensor([stand]), torch.tensor([1.0])
+def held_env(checkpoint, laws: UpperBodyConfig) -> HumanoidEnv:
+    """One robot in the air that walks for a second and is then asked to stand, forces on its hands."""
+    cfg = load_policy(checkpoint).env_config
+    cfg.fixed_base, cfg.upper_body, cfg.collision = True, laws, "feet"
+    cfg.randomization.enabled = False
+    cfg.forces.scripted.force, cfg.forces.scripted.hand, cfg.forces.scripted.start_s = (8.0, -5.0, -6.0), "both", 0.5
+    return HumanoidEnv(cfg)
+
+
+def command(commands, walk: bool, height: float) -> None:
+    on = float(walk)
+    commands.override(
+        torch.tensor([[0.6, 0.2]]) * on, torch.tensor([0.4]) * on, torch.tensor([1.0 - on]), torch.tensor([height])
     )
-    obs = env.reset()
-    start = {
-        "qpos": env.sim.qpos[0].numpy().copy(), "qvel": env.sim.qvel[0].numpy().copy(),
-        "commands": env.commands.state_dict(), "motion": env.motions.state_dict(),
-    }  # fmt: skip
-    joints, torques = [], []
-    for _ in range(round(seconds / env.dt)):
-        obs, _, dones, _ = env.step(policy(as_dict(obs)))
-        assert not dones.any()
-        joints.append(env.sim.qpos[0, 7:].numpy().copy())
-        torques.append(env.joint_torque(env.state)[0].numpy().copy())
-    return env, joints, torques, start
 
 
-# Standing is fed back for feet on the ground: in the air it oscillates, and rounding grows tenfold every 0.2 s.
-@pytest.mark.parametrize(
-    ("law", "stand", "seconds", "leans"),
-    [("pd", 0.0, 2.0, False), ("cotap", 0.0, 2.0, False), ("mixed", 0.0, 2.0, False), ("pd", 1.0, 0.6, False),
-     ("pd", 0.0, 2.0, True), ("cotap", 0.0, 2.0, True)],
-)  # fmt: skip
-def test_the_loop_is_the_batched_environment(law, stand, seconds, leans, policy, spec):
-    laws = laws_named(law)
-    env, expected, torques, start = batched(laws, stand, seconds, leans)
-    motion = ArmMotion(clip="punch").reference(spec, env.dt)
-    engine_cfg = EngineConfig(timestep=0.01, collision="feet", cone="pyramidal")
-    robot = Robot(make_engine(engine_cfg, spec), engine_cfg, spec, env.dt, Perturbations())
-    controller = Controller(policy, spec, laws, env.cfg.commands, motion, seed=1)
+def beside_it(env: HumanoidEnv, policy: OnnxPolicy, laws: UpperBodyConfig) -> tuple[Robot, Controller]:
+    """The deployed loop, begun where the environment begins."""
+    spec = env.spec
+    robot = Robot(make_engine(ENGINE, spec), ENGINE, spec, env.dt, Perturbations())
+    controller = Controller(policy, spec, laws, env.cfg.commands, ReferenceMotion(env.cfg.motions, spec, 1, env.dt), 1)
+    env.rng.manual_seed(1)  # both draw the arms' motion alike
     controller.commands.resample = False
-    controller.commands.load_state_dict(start["commands"])
-    controller.motion.load_state_dict(start["motion"])
-    robot.place(start["qpos"], start["qvel"])
+    controller.commands.load_state_dict(env.commands.state_dict())
+    controller.motion.load_state_dict(env.motions.state_dict())
+    robot.place(env.sim.qpos[0].numpy().copy(), env.sim.qvel[0].numpy().copy())
     robot.engine.hold(True)
+    return robot, controller
+
+
+class Watched(OnnxPolicy):
+    """Keeps what it has observed last."""
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        self.observed = observation
+        return super().__call__(observation)
+
+
+KINDS = [(robot, mode, "pd") for robot in ("h1", "made-up") for mode in ("residual", "absolute")]
+KINDS += [("h1", "residual", "cotap"), ("h1", "absolute", "cotap"), ("h1", "residual", "mixed")]
+
+
+@pytest.mark.parametrize(("name", "mode", "law"), KINDS)
+def test_the_loop_is_the_environment(name, mode, law, random_checkpoint, random_policy):
+    kind: dict[str, Any] = {"robot": name, "upper_mode": mode, "output_gain": 0.3}
+    laws, in_torch = laws_named(law), load_policy(random_checkpoint(**kind))
+    env = held_env(random_checkpoint(**kind), laws)
+    nominal, start = env.spec.nominal_height_m, env.state.joint_pos
+    command(env.commands, True, nominal)
+    obs = env.reset()
+    policy = Watched(random_policy(**kind))
+    robot, controller = beside_it(env, policy, laws)
     moved = 0.0
-    for k, (joints, torque) in enumerate(zip(expected, torques, strict=True)):
-        push = env.scripted.at(torch.tensor([k * env.dt]))[0, :-1].double().numpy()
-        robot.act(controller.step(robot.read()), push)
-        np.testing.assert_allclose(robot.engine.qpos[7:], joints, atol=1e-4, err_msg=f"step {k}")
-        np.testing.assert_allclose(robot.torque(), torque, atol=0.05, err_msg=f"step {k}")
-        moved = max(moved, float(np.abs(joints - start["qpos"][7:]).max()))
-    assert moved > (0.1 if stand else 0.3)  # the policy did something
+    for k in range(round(SECONDS / env.dt)):
+        push = env.forces.scripted.at(torch.tensor([k * env.dt]))[0, :-1].double().numpy()
+        asked = controller.step(robot.read())
+        # Torques are of some 10 Nm, in single precision.
+        np.testing.assert_allclose(policy.observed, obs["policy"][0].numpy(), 1e-5, 1e-5, err_msg=f"step {k}")
+        if k == 50:
+            for commands in (env.commands, controller.commands):
+                command(commands, False, nominal - 0.1)
+        obs, _, dones, _ = env.step(in_torch(as_dict(obs)))
+        assert not dones.any()
+        np.testing.assert_allclose(controller.targets, env.actuation.current[0].numpy(), 0.0, 1e-5, err_msg=f"step {k}")
+        robot.act(asked, push)
+        np.testing.assert_allclose(robot.engine.qpos[7:], env.sim.qpos[0, 7:].numpy(), 0.0, 1e-5, err_msg=f"step {k}")
+        moved = max(moved, float((env.state.joint_pos - start).abs().max()))
+    assert env.commands.current().stand.all()  # walked, and came to rest
+    assert moved > 0.1  # the policy did something

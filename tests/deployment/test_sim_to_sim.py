@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 import torch
 
-from cotap.compliance.laws import LawConfig
 from cotap.deployment import sim_to_sim
 from cotap.deployment.engines import EngineConfig
 from cotap.deployment.robot import Perturbations
@@ -48,7 +47,7 @@ def test_rates_of_falls_have_wilsons_interval():
 
 @pytest.mark.parametrize("part", [loads, periodic])
 def test_trials_that_fell_are_in_no_figure_of_the_hand(spec: RobotSpec, part: Callable[..., Any]):
-    """Of two trials one falls, its hands far away: what is told is that of the other; of none, nothing."""
+    """Of two trials one falls, its hands far away: what is reported is that of the other; of none, nothing."""
     protocol = ConstantLoad(onset=3.0)
     protocol.episode_seconds = 7.0
 
@@ -93,7 +92,7 @@ def stand(spec: RobotSpec, falls: bool) -> Trial:
         offset = torch.zeros(1, arms, 3, dtype=torch.float64)
         offset[..., 2] = -1.0 if down else height
         row = {name: torch.zeros(1) for name in ("height", "height_command", "path_error")}
-        row |= {name: torch.zeros(1, dtype=torch.bool) for name in ("stand", "told_to_stand", "arm_at_limit")}
+        row |= {name: torch.zeros(1, dtype=torch.bool) for name in ("stand", "arm_at_limit")}
         row |= {name: torch.zeros(1, 3) for name in ("velocity", "command")}
         row |= {
             name: torch.zeros(1, joints) for name in ("arm_error", "arm_velocity", "arm_torque", "arm_static_torque")
@@ -105,28 +104,29 @@ def stand(spec: RobotSpec, falls: bool) -> Trial:
     return trial
 
 
-def test_statics_is_jacobian_transpose_and_compliance(spec, model):
-    """PD: `J^T F` at the elbow, and `J J^T / kp` at the hand, by MuJoCo's Jacobian."""
+def test_statics_is_jacobian_transpose_and_compliance(any_spec, any_model):
+    """PD: `J^T F` at the elbow, wherever it is in the arm, and `J kp^-1 J^T` at the hand, by MuJoCo's Jacobian."""
+    spec, model = any_spec, any_model
     qpos = np.array([0.0, 0.0, 1.02, 1.0, 0.0, 0.0, 0.0, *(j.default_rad for j in spec.joints)])
     qpos[-5:] += 0.3
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     mujoco.mj_forward(model, data)
-    laws = UpperBodyConfig(LawConfig("cotap", alpha=0.0), LawConfig("pd"))
-    for arm, (torque, moved) in zip(spec.arms, statics(spec, laws, qpos, 30.0), strict=True):
+    for arm, (torque, moved) in zip(spec.arms, statics(spec, UpperBodyConfig(), qpos, 30.0), strict=True):
         hand, jacobian = data.body(arm.hand_body), np.zeros((3, model.nv))
         point = hand.xpos + hand.xmat.reshape(3, 3) @ arm.hand_point
         mujoco.mj_jac(model, data, jacobian, None, point, hand.id)
         row = jacobian[2, [model.joint(name).dofadr[0] for name in arm.joints]]
-        assert torque == pytest.approx(30.0 * abs(row[-1]), rel=1e-6)
-        assert moved == pytest.approx(30.0 * float(row @ row) / 100.0, rel=1e-6)
+        kp = np.array([spec.joint(name).kp for name in arm.joints])
+        assert torque == pytest.approx(30.0 * abs(row[arm.joints.index(f"{arm.side}_elbow")]), rel=1e-6)
+        assert moved == pytest.approx(30.0 * float(row @ (row / kp)), rel=1e-6)
 
 
 @pytest.mark.slow
-def test_a_small_comparison_is_written_whole(policy_file, tmp_path, monkeypatch, script):
+def test_a_small_comparison_is_written_whole(shipped_file, tmp_path, monkeypatch, script):
     monkeypatch.setattr(sim_to_sim, "LAWS", {"PD": "pd"})
     monkeypatch.setattr(sim_to_sim, "PERTURBATIONS", {"late": Perturbations(delay_steps=(1, 1))})
-    arguments = ["--policy", str(policy_file), "--engines", "mujoco", "--trials", "1", "--perturbed-trials", "1",
+    arguments = ["--policy", str(shipped_file), "--engines", "mujoco", "--trials", "1", "--perturbed-trials", "1",
                  "--load-trials", "1", "--seconds", "2", "--timestep", "0.01", "--jobs", "1", "--output",
                  str(tmp_path)]  # fmt: skip
     assert script.main(arguments) == 0

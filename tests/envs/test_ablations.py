@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+from env_tools import drive, newest, privileged
 
 from cotap.compliance import modulate_stiffness, resolve_joint_stiffness
 from cotap.compliance.laws import LawConfig
@@ -13,48 +14,50 @@ from cotap.configs import BASE_RECIPES, DISTILL_RECIPES
 from cotap.envs.observations import ObservationConfig
 from cotap.envs.upper_body import LawSampling, UpperBodyConfig
 
-TORQUE = 8
 
-
-def test_arm_torque_moves_from_the_actor_to_the_critic(make_env):
-    usual, moved = make_env(3), make_env(3, observations=ObservationConfig(arm_torque="critic"))
-    one, two = usual.get_observations(), moved.get_observations()
-    assert one["policy"].shape[1] - two["policy"].shape[1] == 5 * TORQUE
-    torch.testing.assert_close(two["policy"], one["policy"][:, : -5 * TORQUE])
-    # The critic's: orientation, velocity, torque, forces.
-    torque = one["policy"][:, -TORQUE:]
-    torch.testing.assert_close(two["privileged"][:, 7 : 7 + TORQUE], torque)
-    torch.testing.assert_close(two["privileged"][:, 7 + TORQUE :], one["privileged"][:, 7:])
-    assert usual.layout()["terms"] != moved.layout()["terms"]
-    assert ["arm_torque", 8, 1.0] in moved.layout()["critic_terms"]
-
-
-def test_goals_are_what_the_laws_are_asked_for(make_env):
-    left, right = LawConfig("cotap", (300.0 * math.e, 300.0, 300.0 / math.e), 40.0 * math.e, 0.25), LawConfig("pd")
-    env = make_env(2, observations=ObservationConfig(goals=True), upper_body=UpperBodyConfig(left, right))
-    goals = env.get_observations()["policy"][0, -10:]
-    assert goals.tolist() == pytest.approx([1.0, 0.0, -1.0, 1.0, 0.25, 0.0, 0.0, 0.0, 0.0, 1.0], abs=1e-5)
-    mirrored = env.symmetry.observations["policy"](env.get_observations()["policy"])[0, -10:]
-    assert mirrored.tolist() == pytest.approx([*goals[5:].tolist(), *goals[:5].tolist()])
-
-
-def test_mirror_images_of_the_critics_observation_are_their_own(make_env):
-    env = make_env(4, observations=ObservationConfig(arm_torque="critic", goals=True))
-    obs = env.get_observations()
-    for group, value in obs.items():
-        reflect = env.symmetry.observations[group]
-        torch.testing.assert_close(reflect(reflect(value)), value)
-        assert reflect.index.numel() == value.shape[1]
-
-
-def test_goals_vary_in_the_base_that_learns_to_see_them(make_env):
-    env = make_env(
-        16, observations=ObservationConfig(goals=True), upper_body=UpperBodyConfig(sampling=LawSampling(True))
+def test_arm_torque_moves_from_the_actor_to_the_critic(make_env, robot):
+    usual, moved = (
+        make_env(3, robot=robot, observations=ObservationConfig(arm_torque=seen)) for seen in ("actor", "critic")
     )
+    for env in (usual, moved):
+        drive(env, 2)
+    one, two = usual.get_observations(), moved.get_observations()
+    width = len(usual.spec.upper_joints)
+    assert one["policy"].shape[1] - two["policy"].shape[1] == 5 * width
+    torch.testing.assert_close(two["policy"], one["policy"][:, : -5 * width])
+    torch.testing.assert_close(two["present"], one["present"][:, :-width])
+    # The critic's: orientation, velocity, torque, forces.
+    torque = newest(usual, one["policy"])["arm_torque"]
+    assert torque.any()
+    torch.testing.assert_close(privileged(moved, two["privileged"])["arm_torque"], torque)
+    torch.testing.assert_close(two["privileged"][:, 7 + width :], one["privileged"][:, 7:])
+    assert usual.layout()["terms"] != moved.layout()["terms"]
+    assert ["arm_torque", width, 1.0] in moved.layout()["critic_terms"]
+
+
+def test_goals_are_what_the_laws_are_asked_for(make_env, robot):
+    left = LawConfig("facet", (300.0 * math.e, 300.0, 300.0 / math.e), 40.0 * math.e, 0.25)
+    env = make_env(
+        2, robot=robot, observations=ObservationConfig(goals=True), upper_body=UpperBodyConfig(left, LawConfig("pd"))
+    )
+    expected = [1.0, 0.0, -1.0, 1.0, 0.25, 0.0, 0.0, 0.0, 0.0, 1.0]
+    obs = env.get_observations()
+    goals = newest(env, obs["policy"])["goals"][0]
+    assert goals.tolist() == pytest.approx(expected, abs=1e-5)
+    assert obs["present"][0, -10:].tolist() == pytest.approx(expected, abs=1e-5)
+    mirrored = newest(env, env.symmetry.observations["policy"](obs["policy"]))["goals"][0]
+    assert mirrored.tolist() == pytest.approx([*expected[5:], *expected[:5]], abs=1e-5)
+
+
+def test_goals_vary_where_they_are_drawn(make_env, robot):
+    env = make_env(
+        16, robot=robot, observations=ObservationConfig(goals=True),
+        upper_body=UpperBodyConfig(sampling=LawSampling(True)),
+    )  # fmt: skip
     assert float(env.get_observations()["policy"][:, -10:].std(0).min()) > 0.05
 
 
-def test_without_the_ratio_stiffness_is_what_alpha_alone_makes_of_it(make_env):
+def test_without_the_ratio_alpha_alone_says_how_stiff_arms_are(make_env):
     """At an elbow angle with a condition number beyond 10, against the general form with the plain alpha."""
     law = LawConfig("cotap", (300.0, 200.0, 400.0), 30.0, 0.6)
     env = make_env(2, upper_body=UpperBodyConfig(law, law, singularity_ratio=False))
@@ -62,7 +65,7 @@ def test_without_the_ratio_stiffness_is_what_alpha_alone_makes_of_it(make_env):
     for e in (env, with_ratio):
         e.sim.qpos[:, 7 + 14] = e.sim.qpos[:, 7 + 18] = 1.45
         e.state = e.reader.read()
-        e.upper_body.send(e.state, e.targets.current[:, 11:], e.motions.current().velocity)
+        e.upper_body.send(e.state, e.actuation.current[:, 11:], e.motions.current().velocity)
     s = env.state
     jacobian = (s.heading_w.transpose(1, 2) @ s.torso_rotation_w).unsqueeze(1) @ env.reader.arm_chains.jacobian(s.arms)
     jacobian = jacobian.double()
@@ -84,7 +87,7 @@ def test_the_threshold_of_the_ratio_is_the_laws_own(make_env):
         env = make_env(1, upper_body=cfg)
         env.sim.qpos[:, 7 + 14] = env.sim.qpos[:, 7 + 18] = 1.45
         env.state = env.reader.read()
-        env.upper_body.send(env.state, env.targets.current[:, 11:], env.motions.current().velocity)
+        env.upper_body.send(env.state, env.actuation.current[:, 11:], env.motions.current().velocity)
         stiffness.append(env.upper_body.stiffness[0])
     torch.testing.assert_close(stiffness[0][0], stiffness[1][0])
     assert (stiffness[0][1] - stiffness[1][1]).abs().max() > 1.0

@@ -3,55 +3,53 @@
 from __future__ import annotations
 
 import copy
-import sys
-from pathlib import Path
 
 import pytest
 import torch
+from elsewhere import DEVICE, Elsewhere, elsewhere
 
 from cotap.compliance.laws import LawConfig
-from cotap.envs import H1Env, H1EnvConfig
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-from elsewhere import DEVICE, Elsewhere, elsewhere
+from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 
 STEPS = 12
 
 
-def everything() -> H1EnvConfig:
+def everything(robot: str) -> HumanoidEnvConfig:
     """All that an environment can do, at once, and often."""
-    cfg = H1EnvConfig(num_envs=3, num_threads=1)
-    cfg.assist.enabled = cfg.blows.enabled = cfg.observations.noise.enabled = cfg.observations.goals = True
-    cfg.observations.arm_torque = "critic"
-    cfg.upper_body.left = LawConfig(name="cotap", sensing="estimated")
+    cfg = HumanoidEnvConfig(robot=robot, num_envs=3, num_threads=1, unevenness_m=0.02)
+    cfg.assist.enabled = True
+    cfg.observations.noise.enabled = cfg.observations.goals = True
+    cfg.observations.arm_torque, cfg.observations.critic = "critic", "history" if robot == "h1" else "present"
+    cfg.upper_body.left = LawConfig(name="cotap" if robot == "h1" else "hmc", sensing="estimated")
     cfg.upper_body.right = LawConfig(name="facet")
     cfg.upper_body.sampling.enabled = True
     cfg.upper_body.sampling.hold_s = (0.1, 0.2)
     cfg.upper_body.torso.model = "support"
     cfg.commands.resample_s = (0.1, 0.3)
-    cfg.commands.steady_rad, cfg.commands.step_timing = 0.2, True
-    cfg.impedance.share = 0.5
-    cfg.hand_forces.hold_s = (0.1, 0.2)
-    cfg.hand_forces.curriculum_start = 1.0
-    cfg.blows.interval_s, cfg.blows.recovery_s = (0.1, 0.2), 0.1
-    cfg.force.force, cfg.force.start_s, cfg.force.random_direction = (5.0, 5.0, 0.0), 0.1, True
-    cfg.punches.force_n, cfg.punches.segment_s = 20.0, 0.2
+    cfg.path.share = 0.5
+    forces = cfg.forces
+    forces.hand_loads.enabled, forces.hand_loads.hold_s = True, (0.1, 0.2)
+    forces.pushes.enabled, forces.pushes.interval_s = True, (0.12, 0.2)
+    forces.pushes.ramp.full_samples = 30.0
+    forces.scripted.force, forces.scripted.start_s, forces.scripted.random_direction = (5.0, 5.0, 0.0), 0.1, True
+    forces.punches.force_n, forces.punches.segment_s = 20.0, 0.2
     cfg.motions.clips.hold_s = (0.1, 0.3)
-    cfg.rewards.upper.track_hands_as_facet = cfg.rewards.upper.stay_close = 1.0
-    cfg.unevenness_m = 0.02
+    cfg.rewards.upper.track_hands_as_facet = cfg.rewards.upper.reference_closeness = 1.0
     cfg.terminations.episode_s = 0.1
     return cfg
 
 
-def run(cfg: H1EnvConfig) -> list[torch.Tensor]:
+def run(cfg: HumanoidEnvConfig) -> list[torch.Tensor]:
     """Steps with actions that fell robots, other laws on the way, and a state that is saved and taken over."""
-    env = H1Env(copy.deepcopy(cfg))
+    env = HumanoidEnv(copy.deepcopy(cfg))
+    env.keeps_final_observation = True
     rng = torch.Generator().manual_seed(3)
     seen: list[torch.Tensor] = []
     for step in range(STEPS):
         actions = 3.0 * torch.randn(cfg.num_envs, env.num_actions, generator=rng)
         observations, rewards, dones, extras = env.step(actions.to(env.device))
         seen += [*observations.values(), rewards, dones, *extras["log"].values(), extras["group_rewards"]]
+        seen += [env.final_observation] if dones.any() else []
         if step == STEPS // 3:
             env.set_law(1, 0, LawConfig(name="dcc"))
             env.set_law(2, 1, LawConfig())
@@ -59,15 +57,15 @@ def run(cfg: H1EnvConfig) -> list[torch.Tensor]:
             saved = env.state_dict()
         if step == 2 * STEPS // 3:
             env.load_state_dict(saved)
-            env.reset_alike(5)
+            env.reset_identical(5)
     return seen
 
 
 @pytest.mark.filterwarnings("ignore:for .* copying from a non-meta parameter:UserWarning")
-def test_an_environment_elsewhere_computes_the_same(monkeypatch):
-    here = run(everything())
+def test_an_environment_elsewhere_computes_the_same(monkeypatch, robot):
+    here = run(everything(robot))
     with elsewhere(monkeypatch.setattr):
-        there = run(everything())
+        there = run(everything(robot))
         assert all(isinstance(value, Elsewhere) for value in there if value.dim() > 0)
     assert len(here) == len(there)
     for mine, other in zip(here, there, strict=True):

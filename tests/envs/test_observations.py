@@ -1,3 +1,5 @@
+"""The layout of observations, their history and their noise, by hand."""
+
 from __future__ import annotations
 
 import pytest
@@ -31,6 +33,16 @@ def test_terms_are_the_papers():
     assert [s for _, _, s in critic_terms(2)] == [1.0, 2.0, 0.1, 0.1]
 
 
+def test_terms_have_the_robots_sizes(any_spec):
+    joints, upper, arms = len(any_spec.joints), len(any_spec.upper_joints), len(any_spec.arms)
+    widths = {name: width for name, width, _ in actor_terms(joints, upper, num_goals=5 * arms)}
+    assert sum(widths.values()) == 13 + 3 * joints + 2 * upper + 5 * arms
+    assert widths["last_action"] == joints
+    assert widths["arm_torque"] == upper
+    assert "arm_torque" not in [name for name, _, _ in actor_terms(joints, upper, arm_torque=False)]
+    assert sum(width for _, width, _ in critic_terms(arms, upper)) == 7 + upper + 3 * arms
+
+
 def test_history_is_term_by_term_and_oldest_first():
     history = ObservationHistory(TERMS, 1, 3)
     no_one = torch.tensor([False])
@@ -40,7 +52,7 @@ def test_history_is_term_by_term_and_oldest_first():
     assert buffer.tolist() == [[2, 12, 3, 13, 4, 14, 102, 103, 104]]
 
 
-def test_a_restart_fills_the_history_of_its_world_only():
+def test_a_restart_fills_the_history_of_its_env_only():
     history = ObservationHistory(TERMS, 2, 3)
     for t in (1.0, 2.0, 3.0):
         history.append(torch.full((2, 3), t), torch.tensor([False, False]))
@@ -77,6 +89,8 @@ def test_noise_is_scaled_like_the_observation():
     ("cfg", "match"),
     [
         (ObservationConfig(history=0), "observations.history"),
+        (ObservationConfig(critic="all"), "observations.critic"),
+        (ObservationConfig(arm_torque="nobody"), "observations.arm_torque"),
         (ObservationConfig(noise=NoiseConfig(gravity=-1.0)), "observations.noise.gravity"),
     ],
 )

@@ -1,3 +1,5 @@
+"""Punches on the arms: one in every stretch of time, of exact impulse."""
+
 from __future__ import annotations
 
 import pytest
@@ -8,10 +10,10 @@ from cotap.envs.punches import PunchConfig, Punches
 DT = 0.02
 
 
-def impulses(cfg: PunchConfig, worlds: int, seconds: float, seed: int = 0) -> torch.Tensor:
+def impulses(cfg: PunchConfig, num_envs: int, seconds: float, seed: int = 0) -> torch.Tensor:
     """Forces (T, N, J, 3) over time."""
-    punches, rng = Punches(cfg, worlds, 8, DT), torch.Generator().manual_seed(seed)
-    punches.reset(torch.ones(worlds, dtype=torch.bool), rng)
+    punches, rng = Punches(cfg, num_envs, 8, DT), torch.Generator().manual_seed(seed)
+    punches.reset(torch.ones(num_envs, dtype=torch.bool), rng)
     rows = []
     for _ in range(round(seconds / DT)):
         rows.append(punches.current())
@@ -19,7 +21,7 @@ def impulses(cfg: PunchConfig, worlds: int, seconds: float, seed: int = 0) -> to
     return torch.stack(rows)
 
 
-def test_one_blow_per_segment_of_its_length_on_one_joint():
+def test_one_punch_per_segment_of_its_length_on_one_joint():
     force = impulses(PunchConfig(600.0, 0.08, 1.0), 50, 4.0)
     for segment in force.split(50):
         on = segment.norm(dim=3) > 0.0
@@ -40,7 +42,7 @@ def test_impulses_are_uniform_and_directions_isotropic():
     assert struck.tolist() == pytest.approx([1 / 8] * 8, abs=0.03)
 
 
-def test_no_force_no_blows():
+def test_no_force_no_punches():
     assert not impulses(PunchConfig(), 5, 1.0).any()
 
 

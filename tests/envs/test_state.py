@@ -1,4 +1,7 @@
-"""The state reader against MuJoCo's own kinematics and velocities, on tumbling robots."""
+"""The state reader against MuJoCo's own kinematics and velocities, on tumbling robots.
+
+The made-up robot's torso is carried by three hinges, off the base's origin: no lever arm may be forgotten.
+"""
 
 from __future__ import annotations
 
@@ -11,45 +14,15 @@ import pytest
 import torch
 
 from cotap.envs.state import StateReader
-from cotap.robots import RobotSpec
-from cotap.robots.mjcf import build_model
 from cotap.sim import BatchSimulation
 
 N = 12
 
 
-def with_two_waist_joints(spec: RobotSpec) -> RobotSpec:
-    """A robot whose torso is carried by two hinges, off the pelvis' origin: no lever arm may be forgotten."""
-    torso = spec.body("torso_link")
-    waist = dataclasses.replace(
-        torso, name="waist_link", pos=(0.02, 0.03, 0.1), mass_kg=1.0, diaginertia=(0.01,) * 3, joint="waist_roll",
-        collision=(), visual=(),
-    )  # fmt: skip
-    at = spec.bodies.index(torso)
-    upper = dataclasses.replace(torso, parent="waist_link", pos=(0.1, -0.05, 0.2))
-    yaw = spec.indices(["torso"])[0]
-    roll = dataclasses.replace(spec.joints[yaw], name="waist_roll", axis=(1.0, 0.0, 0.0), mirror_name="waist_roll")
-    return dataclasses.replace(
-        spec,
-        bodies=(*spec.bodies[:at], waist, upper, *spec.bodies[at + 1 :]),
-        joints=(*spec.joints[:yaw], roll, *spec.joints[yaw:]),
-    )
-
-
-@pytest.fixture(scope="module", params=["h1", "two waist joints"])
-def robot(request, spec):
-    return spec if request.param == "h1" else with_two_waist_joints(spec)
-
-
 @pytest.fixture(scope="module")
-def tumbling_model(robot):
-    return build_model(robot)
-
-
-@pytest.fixture(scope="module")
-def read(robot, tumbling_model):
-    """A state and the single worlds that it must agree with."""
-    model = tumbling_model
+def read(any_spec, any_model):
+    """A state and the single robots that it must agree with."""
+    model = any_model
     rng = torch.Generator().manual_seed(3)
     sim = BatchSimulation(model, N, 2, 1)
     qpos = torch.zeros(N, model.nq, dtype=torch.float64)
@@ -58,13 +31,13 @@ def read(robot, tumbling_model):
     qpos[:, 7:] = 0.5 * torch.randn(N, model.nq - 7, generator=rng)
     qvel = torch.randn(N, model.nv, generator=rng).double()
     sim.reset(torch.ones(N, dtype=torch.bool), qpos, qvel)
-    worlds = []
+    robots = []
     for i in range(N):
         data = mujoco.MjData(model)
         data.qpos[:], data.qvel[:] = qpos[i], qvel[i]
         mujoco.mj_forward(model, data)
-        worlds.append(data)
-    return StateReader(robot, sim).read(), worlds
+        robots.append(data)
+    return StateReader(any_spec, sim).read(), robots
 
 
 def check(actual: torch.Tensor, expected: list[np.ndarray], atol: float = 1e-5) -> None:
@@ -78,71 +51,75 @@ def velocity(model, data, body: str) -> tuple[np.ndarray, np.ndarray]:
     return out[:3], out[3:]
 
 
-def heading(data) -> np.ndarray:
+def heading(data, torso: str) -> np.ndarray:
     """Built from the angle, as the definition says: z up, x along the torso's yaw."""
-    forward = data.body("torso_link").xmat.reshape(3, 3)[:, 0]
+    forward = data.body(torso).xmat.reshape(3, 3)[:, 0]
     yaw = math.atan2(forward[1], forward[0])
     return np.array([[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0], [0, 0, 1]])
 
 
 def test_joints(read):
-    state, worlds = read
-    check(state.joint_pos, [d.qpos[7:] for d in worlds])
-    check(state.joint_vel, [d.qvel[6:] for d in worlds])
+    state, robots = read
+    check(state.joint_pos, [d.qpos[7:] for d in robots])
+    check(state.joint_vel, [d.qvel[6:] for d in robots])
 
 
-def test_poses(read):
-    state, worlds = read
-    check(state.base_rotation_w, [d.body("pelvis").xmat.reshape(3, 3) for d in worlds])
-    check(state.torso_rotation_w, [d.body("torso_link").xmat.reshape(3, 3) for d in worlds])
-    check(state.torso_pos_w, [d.body("torso_link").xpos for d in worlds])
-    check(state.height, [d.body("torso_link").xpos[2] for d in worlds])
-    check(state.heading_w, [heading(d) for d in worlds])
+def test_poses(read, any_spec):
+    state, robots = read
+    check(state.base_rotation_w, [d.body(any_spec.base_body).xmat.reshape(3, 3) for d in robots])
+    check(state.torso_rotation_w, [d.body(any_spec.torso_body).xmat.reshape(3, 3) for d in robots])
+    check(state.torso_pos_w, [d.body(any_spec.torso_body).xpos for d in robots])
+    check(state.height, [d.body(any_spec.torso_body).xpos[2] for d in robots])
+    check(state.heading_w, [heading(d, any_spec.torso_body) for d in robots])
 
 
-def test_torso_velocities(read, tumbling_model):
-    state, worlds = read
-    angular, linear = zip(*(velocity(tumbling_model, d, "torso_link") for d in worlds), strict=True)
+def test_torso_velocities(read, any_spec, any_model):
+    state, robots = read
+    angular, linear = zip(*(velocity(any_model, d, any_spec.torso_body) for d in robots), strict=True)
     check(
         state.torso_angular_velocity_t,
-        [d.body("torso_link").xmat.reshape(3, 3).T @ w for d, w in zip(worlds, angular, strict=True)],
+        [d.body(any_spec.torso_body).xmat.reshape(3, 3).T @ w for d, w in zip(robots, angular, strict=True)],
     )
     check(state.yaw_rate, [w[2] for w in angular])
-    check(state.torso_linear_velocity_h, [heading(d).T @ v for d, v in zip(worlds, linear, strict=True)])
+    check(
+        state.torso_linear_velocity_h,
+        [heading(d, any_spec.torso_body).T @ v for d, v in zip(robots, linear, strict=True)],
+    )
 
 
-def test_gravity_points_down(read):
-    state, worlds = read
+def test_gravity_points_down(read, any_spec):
+    state, robots = read
     down = np.array([0.0, 0.0, -1.0])
-    check(state.projected_gravity_t, [d.body("torso_link").xmat.reshape(3, 3).T @ down for d in worlds])
+    check(state.projected_gravity_t, [d.body(any_spec.torso_body).xmat.reshape(3, 3).T @ down for d in robots])
 
 
-def test_arms_reach_the_hands(read):
-    state, worlds = read
-    for a, side in enumerate(("left", "right")):
-        check(state.hand_pos_w[:, a], [d.site(f"{side}_hand").xpos for d in worlds])
+def test_arms_reach_the_hands(read, any_spec):
+    state, robots = read
+    for a, arm in enumerate(any_spec.arms):
+        check(state.hand_pos_w[:, a], [d.site(f"{arm.side}_hand").xpos for d in robots])
 
 
-def test_feet(read, tumbling_model):
-    state, worlds = read
-    for f, side in enumerate(("left", "right")):
-        site = f"{side}_foot"
-        check(state.foot_pos_w[:, f], [d.site(site).xpos for d in worlds])
-        check(state.foot_up_w[:, f], [d.site(site).xmat.reshape(3, 3)[:, 2] for d in worlds])
-        check(state.foot_forward_w[:, f], [d.site(site).xmat.reshape(3, 3)[:, 0] for d in worlds])
+def test_feet(read, any_spec, any_model):
+    state, robots = read
+    for f, foot in enumerate(any_spec.feet):
+        site = f"{foot.side}_foot"
+        check(state.foot_pos_w[:, f], [d.site(site).xpos for d in robots])
+        check(state.foot_up_w[:, f], [d.site(site).xmat.reshape(3, 3)[:, 2] for d in robots])
+        check(state.foot_forward_w[:, f], [d.site(site).xmat.reshape(3, 3)[:, 0] for d in robots])
         expected = []
-        for data in worlds:
-            angular, linear = velocity(tumbling_model, data, f"{side}_ankle_link")
-            arm = data.site(site).xpos - data.body(f"{side}_ankle_link").xpos
+        for data in robots:
+            angular, linear = velocity(any_model, data, foot.body)
+            arm = data.site(site).xpos - data.body(foot.body).xpos
             expected.append(linear + np.cross(angular, arm))
         check(state.foot_velocity_w[:, f], expected)
 
 
-def test_foot_force_and_contact(spec, model):
+def test_foot_force_and_contact(any_spec, any_model):
     """One foot on the floor carries the load that MuJoCo's contacts report; the other, lifted, none."""
+    spec, model = any_spec, any_model
     sim = BatchSimulation(model, 1, 2, 1)
     qpos = torch.zeros(1, model.nq)
-    qpos[0, 2], qpos[0, 3] = spec.nominal_height_m - 0.003, 1.0
+    qpos[0, 2], qpos[0, 3] = spec.base_height_m - 0.003, 1.0
     qpos[0, 7:] = torch.tensor([j.default_rad for j in spec.joints])
     lifted = spec.indices(["right_hip_pitch", "right_knee"])
     qpos[0, 7 + torch.tensor(lifted)] += torch.tensor([-0.5, 0.9])
@@ -158,3 +135,25 @@ def test_foot_force_and_contact(spec, model):
     assert total > 5.0
     assert float(state.foot_force[0, 0]) == pytest.approx(total, rel=1e-5)
     assert state.foot_contact.tolist() == [[True, False]]
+
+
+def test_reading_some_is_reading_all(any_spec, any_model):
+    """A state in which envs are replaced is the one that is read whole."""
+    sim = BatchSimulation(any_model, 5, 2, 1)
+    everyone = torch.ones(5, dtype=torch.bool)
+    rng = torch.Generator().manual_seed(4)
+
+    def place(mask):
+        n = int(mask.sum())
+        qpos = torch.randn(n, any_model.nq, generator=rng).double()
+        qpos[:, 3:7] = torch.nn.functional.normalize(qpos[:, 3:7], dim=1)
+        sim.reset(mask, qpos, torch.randn(n, any_model.nv, generator=rng).double())
+
+    place(everyone)
+    reader = StateReader(any_spec, sim)
+    before = reader.read()
+    place(torch.tensor([False, True, False, True, False]))
+    ids = torch.tensor([1, 3])
+    mixed, whole = before.with_envs(ids, reader.read(ids)), reader.read()
+    torch.testing.assert_close(dataclasses.asdict(mixed), dataclasses.asdict(whole), atol=0.0, rtol=0.0)
+    assert not torch.equal(before.joint_pos, whole.joint_pos)

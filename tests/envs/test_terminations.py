@@ -1,3 +1,5 @@
+"""When an episode ends."""
+
 from __future__ import annotations
 
 import math
@@ -25,8 +27,14 @@ def gravity(tilt: float) -> torch.Tensor:
     ],
 )
 def test_fallen_is_too_low_or_too_tilted(height, tilt, fell):
-    cfg = TerminationConfig(min_height_m=0.5, max_tilt_rad=1.0)
-    assert fallen(cfg, torch.tensor([height]), gravity(tilt)).item() == fell
+    assert fallen(torch.tensor([height]), gravity(tilt), 0.5, 1.0).item() == fell
+
+
+def test_the_least_height_is_a_share_of_the_robots(any_spec):
+    cfg = TerminationConfig(min_height=0.6)
+    assert cfg.min_height_m(any_spec) == pytest.approx(0.6 * any_spec.nominal_height_m)
+    by_hand = {"h1": 0.6 * 1.0205, "made-up": 0.6 * 0.8028}
+    assert cfg.min_height_m(any_spec) == pytest.approx(by_hand[any_spec.name])
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
@@ -41,6 +49,7 @@ def test_diverged_finds_what_is_too_fast():
     assert diverged(torch.zeros(3, 1), qvel).tolist() == [False, True, True]
 
 
-def test_bad_fields_are_named():
-    with pytest.raises(ValueError, match=r"terminations\.episode_s"):
-        TerminationConfig(episode_s=0.0).check()
+@pytest.mark.parametrize(("field", "value"), [("episode_s", 0.0), ("min_height", 1.5), ("max_tilt_rad", -0.1)])
+def test_bad_fields_are_named(field, value):
+    with pytest.raises(ValueError, match=rf"terminations\.{field}"):
+        TerminationConfig(**{field: value}).check()

@@ -1,4 +1,4 @@
-"""Impact and constant load: measures on hand-made trajectories, and what a blow does in simulation."""
+"""Impact and constant load: measures on hand-made trajectories, and what a push does in simulation."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import pytest
 import torch
 from test_metrics import trajectory
 
-from cotap.envs import H1Env, H1EnvConfig
+from cotap.envs import HumanoidEnv, HumanoidEnvConfig
+from cotap.envs.actions import ActionConfig
 from cotap.evaluate import main
 from cotap.evaluation.disturbance import (
     ConstantLoad,
@@ -22,16 +23,15 @@ from cotap.evaluation.disturbance import (
     window_measures,
 )
 from cotap.evaluation.law_options import LawOptions
-from cotap.evaluation.metrics import summarize
-from cotap.evaluation.policy import load_policy, shipped_checkpoint
-from cotap.evaluation.rollout import idle, record_rollout
+from cotap.evaluation.protocol import mirrored_pose
+from cotap.evaluation.rollout import acting, idle, record_rollout
 
 LEFT, RIGHT, BOTH = [0], [1], [0, 1]
 
 
 def test_measures_by_hand():
     """Onset at 1 s, window of 1 s: what lies outside does not count."""
-    t = trajectory(steps=150, worlds=2)
+    t = trajectory(steps=150, envs=2)
     inside = slice(50, 100)
     t.velocity[inside, 0, :2] += torch.tensor([0.3, -0.4])
     t.velocity[:50] += 9.0
@@ -54,7 +54,7 @@ def test_measures_by_hand():
 
 
 def test_a_world_that_falls_is_measured_up_to_its_fall():
-    t = trajectory(steps=100, worlds=2)
+    t = trajectory(steps=100, envs=2)
     t.hand_error[50:75, 0] = 0.1
     t.hand_error[75:, 0] = 9.0
     t.fell[75, 0] = True
@@ -66,7 +66,7 @@ def test_a_world_that_falls_is_measured_up_to_its_fall():
 
 
 def test_the_whole_episode_counts_what_the_window_leaves_out():
-    t = trajectory(steps=100, worlds=1)
+    t = trajectory(steps=100, envs=1)
     t.arm_torque[:50, 0, 0] = 10.0
     assert float(window_measures(t, 50, 100, LEFT)["j_upper"]) == 0.0
     assert float(window_measures(t, 0, 100, LEFT)["j_upper"]) == pytest.approx(5.0)
@@ -92,7 +92,7 @@ def test_recovery_by_hand():
 
 def test_displacement_is_what_the_load_adds():
     """5 cm down under the load, 1 cm off before it, in the hand that is loaded."""
-    t = trajectory(steps=150, worlds=2)
+    t = trajectory(steps=150, envs=2)
     t.hand_offset[:, :, 0, 2] = -0.01
     t.hand_offset[50:, :, 0, 2] = -0.06
     t.hand_offset[50:, :, 1, 2] = 9.0
@@ -105,7 +105,7 @@ def test_displacement_is_what_the_load_adds():
 
 def test_a_load_overshoots_by_what_it_carries_the_hand_beyond_its_rest():
     """From 0.01 m to rest 0.1 m lower, at first 0.13 m: by 0.3; to the side, and after a fall, nothing counts."""
-    t = trajectory(steps=200, worlds=3)
+    t = trajectory(steps=200, envs=3)
     t.hand_offset[:, :, 0, 2] = 0.01
     t.hand_offset[50:, :2, 0, 2] = -0.09
     t.hand_offset[60:65, :, 0, 2] = -0.12
@@ -116,16 +116,51 @@ def test_a_load_overshoots_by_what_it_carries_the_hand_beyond_its_rest():
     assert over[1:].isnan().all()  # the last one's hand rests where it was
 
 
-def test_falls_are_told_apart_by_when():
-    t = trajectory(steps=150, worlds=5)
-    for world, step in enumerate((10, 50, 99, 100)):
-        t.fell[step, world] = True
+def test_falls_count_to_the_end_of_their_window():
+    """Onset at 1 s, measures for 1 s, falls for 3 s after it, record of 5 s."""
+    protocol = Impact(num_envs=3, episode_seconds=5.0)
+    t = trajectory(steps=250, envs=3)
+    t.fell[190, 0] = t.fell[220, 1] = True
+    env = HumanoidEnv(protocol.configure(HumanoidEnvConfig(num_threads=1)))
+    result = protocol.measure(t, env)
+    assert result["falls"] == {"before_onset": 0, "to_window_end": 1, "later": 1}
+    assert result["metrics"]["fall_fraction"]["mean"] == pytest.approx(1.0 / 3.0)
+
+
+@pytest.mark.parametrize("mode", ["residual", "absolute"])
+def test_the_raw_reference_takes_the_upper_agents_place(make_env, robot, mode):
+    """A policy that would throw the arms about is not asked; arms are sent where the reference is."""
+    env = make_env(2, robot=robot, actions=ActionConfig(upper_mode=mode))
+    env.motions.hold(env.motions.default + 0.1)
+    wild = acting(env, lambda _: torch.full((2, env.num_actions), 5.0), "reference")
+    action = wild({})
+    assert (action[:, env.action_slices["lower"]] == 5.0).all()
+    env.step(action)
+    upper = env.action_slices["upper"]
+    torch.testing.assert_close(env.actuation.current[:, upper], env.motions.current().position)
+    assert (acting(env, lambda _: torch.full((2, env.num_actions), 5.0), "policy")({})[:, upper] == 5.0).all()
+
+
+def test_arms_hold_a_pose_of_as_many_joints_as_they_have(make_env, robot):
+    env = make_env(1, robot=robot)
+    joints = len(env.spec.arms[0].joints)
+    assert torch.equal(mirrored_pose(env, ()), env.motions.default)
+    left = tuple(0.01 * (i + 1) for i in range(joints))
+    assert mirrored_pose(env, left)[env.spec.upper_joints.index(env.spec.arms[0].joints[1])] == pytest.approx(0.02)
+    with pytest.raises(ValueError, match=f"arm_pose must have {joints} numbers"):
+        mirrored_pose(env, left[1:])
+
+
+def test_falls_are_counted_by_when():
+    t = trajectory(steps=150, envs=5)
+    for env, step in enumerate((10, 50, 99, 100)):
+        t.fell[step, env] = True
     t.fell[120, 0] = True  # once is enough
     assert falls_by_time(t, 50, 100) == {"before_onset": 1, "to_window_end": 2, "later": 1}
 
 
-def test_curves_are_means_over_worlds_that_stood():
-    t = trajectory(steps=100, worlds=2)
+def test_curves_are_means_over_envs_that_stood():
+    t = trajectory(steps=100, envs=2)
     t.hand_error[:, 0] = 0.1
     t.hand_error[:, 1] = 9.0
     t.fell[10, 1] = True
@@ -140,10 +175,10 @@ def test_curves_are_means_over_worlds_that_stood():
     assert c["velocity_error_y"] == pytest.approx([0.2] * 100)
 
 
-def run(protocol, **laws):
-    cfg = protocol.configure(H1EnvConfig(num_threads=1))
+def run(protocol, robot="h1", **laws):
+    cfg = protocol.configure(HumanoidEnvConfig(robot, num_threads=1))
     cfg.upper_body = LawOptions(**laws).configure()
-    env = H1Env(cfg)
+    env = HumanoidEnv(cfg)
     protocol.prepare(env)
     t = record_rollout(env, idle(env), round(protocol.seconds / env.dt), progress=False)
     return t, protocol.measure(t, env)
@@ -169,8 +204,8 @@ def test_statics_asks_for_the_torque_that_holds_the_load():
 
 
 def test_a_blow_moves_the_hand_that_it_hits():
-    blow = Impact(num_envs=2, force=(200.0, 0.0, 0.0), randomize=False, pelvis="fixed", episode_seconds=4.0)
-    t, m = run(blow, method="cotap", stiffness=(800.0,))
+    push = Impact(num_envs=2, force=(200.0, 0.0, 0.0), randomize=False, pelvis="fixed", motion=("none",))
+    t, m = run(push, method="cotap", stiffness=(800.0,))
     assert float(t.hand_error[:49, :, 0].max()) < 0.02
     assert float(t.hand_error[50:, :, 0].max()) > 0.04
     assert float(t.hand_error[50:, :, 1].max()) < 0.05
@@ -180,46 +215,26 @@ def test_a_blow_moves_the_hand_that_it_hits():
     assert "over before" in m["effective_stiffness"]["reason"]
 
 
-def test_a_push_on_the_pelvis_is_on_no_hand():
-    push = Impact(num_envs=2, force=(100.0, 0.0, 0.0), place="base", duration=0.1)
-    cfg = push.configure(H1EnvConfig(num_threads=1))
-    env = H1Env(cfg)
+def test_a_push_on_the_base_is_on_no_hand(robot):
+    push = Impact(num_envs=2, force=(200.0, 0.0, 0.0), place="base", duration=0.1, motion=("none",))
+    env = HumanoidEnv(push.configure(HumanoidEnvConfig(robot, num_threads=1)))
     push.prepare(env)
     velocity = record_rollout(env, idle(env), 60, progress=False).velocity[:, :, 0]
-    assert (velocity[56] - velocity[49] > 0.1).all()  # 10 N s on 50 kg
+    assert (velocity[56] - velocity[49] > 0.1).all()  # 20 N s on 50 kg and less
     assert not env.hand_force_w.any()
 
 
-def test_a_world_is_what_it_is_in_any_company():
-    """Batches of other sizes see other random numbers; figures agree within their intervals."""
-    results = []
-    for worlds, seeds in ((64, (0,)), (32, (1, 2))):
-        parts = [Impact(num_envs=worlds, seed=s, mode="walking", random_direction=True) for s in seeds]
-        rows = []
-        for protocol in parts:
-            cfg = protocol.configure(H1EnvConfig(num_threads=1))
-            env = H1Env(cfg)
-            protocol.prepare(env)
-            t = record_rollout(env, load_policy(shipped_checkpoint("base")), 100, progress=False)
-            rows.append(window_measures(t, 50, 100, LEFT))
-        results.append({k: summarize(torch.cat([r[k] for r in rows])) for k in rows[0]})
-    for name in ("e_torso", "e_ee", "e_ee_hit", "j_upper", "e_upper"):
-        one, two = (r[name]["ci95"] for r in results)
-        assert one[0] <= two[1], name
-        assert two[0] <= one[1], name
-
-
-def test_the_same_seed_gives_the_same_json_and_more_threads_the_same_figures(tmp_path):
+def test_the_same_seed_gives_the_same_json_and_more_threads_the_same_figures(checkpoint, tmp_path):
     """Bit for bit with one number of threads; another may add in another order, and agrees within the intervals."""
     results = []
     for i, threads in enumerate((1, 1, 2)):
         out = tmp_path / f"{i}.json"
-        arguments = ["--num-envs", "32", "--seed", "3", "--episode-seconds", "2", "--json", str(out)]
+        arguments = ["--checkpoint", str(checkpoint), "--num-envs", "32", "--seed", "3", "--json", str(out)]
         assert main(["impact", *arguments, "--threads", str(threads)]) == 0
         results.append(json.loads(out.read_text()))
         results[-1].pop("seconds")
     assert results[0] == results[1]
-    assert results[0]["metrics"]["e_torso"]["std"] > 0.0  # worlds differ, so intervals say something
+    assert results[0]["metrics"]["e_torso"]["std"] > 0.0  # envs differ, so intervals say something
     for name in ("e_torso", "e_ee", "e_ee_hit", "j_upper", "e_upper"):
         one, two = (r["metrics"][name]["ci95"] for r in results[1:])
         assert one[0] <= two[1], name
@@ -227,11 +242,11 @@ def test_the_same_seed_gives_the_same_json_and_more_threads_the_same_figures(tmp
 
 
 @pytest.mark.parametrize("protocol", ["impact", "constant-load"])
-def test_the_command_writes_what_was_asked_for(protocol, tmp_path, capsys):
+def test_the_command_writes_what_was_asked_for(protocol, checkpoint, tmp_path, capsys):
     out = tmp_path / "out.json"
-    arguments = [protocol, "--num-envs", "16", "--method", "cotap", "--stiffness", "500", "--threads", "1",
+    arguments = ["--num-envs", "16", "--method", "cotap", "--stiffness", "500", "--threads", "1",
                  "--json", str(out), "--plot", str(tmp_path / "plot.png")]  # fmt: skip
-    assert main(arguments) == 0
+    assert main([protocol, "--checkpoint", str(checkpoint), *arguments]) == 0
     result = json.loads(out.read_text())
     assert result["protocol"] == protocol
     assert result["settings"]["stiffness"] == [500.0]
@@ -240,6 +255,7 @@ def test_the_command_writes_what_was_asked_for(protocol, tmp_path, capsys):
     assert result["metrics_without_falls"].keys() == result["metrics"].keys()
     assert result["episode"]["metrics"]["j_upper"]["n"] == 16
     assert sum(result["falls"].values()) == result["num_falls"]
+    assert result["arms"] == ("moving" if protocol == "impact" else "held")
     assert (tmp_path / "plot.png").stat().st_size > 5000
     assert result["metrics"]["j_upper_blow"]["n"] == 16
     assert ("load_overshoot" in result["metrics"]) == (protocol == "constant-load")
@@ -249,24 +265,26 @@ def test_the_command_writes_what_was_asked_for(protocol, tmp_path, capsys):
 
 def test_the_blow_itself_is_the_first_tenth_of_a_second():
     protocol = Impact(num_envs=1)
-    t = trajectory(steps=150, worlds=1)
+    t = trajectory(steps=150, envs=1)
     t.arm_torque[50:55, 0, 0] = 30.0
-    env = H1Env(protocol.configure(H1EnvConfig(num_threads=1)))
+    env = HumanoidEnv(protocol.configure(HumanoidEnvConfig(num_threads=1)))
     m = protocol.measure(t, env)["metrics"]
     assert m["j_upper_blow"]["mean"] == pytest.approx(30.0)
     assert m["j_upper"]["mean"] == pytest.approx(3.0)
 
 
-def test_every_worlds_figures_are_those_behind_the_means(tmp_path):
-    out = tmp_path / "out.json"
-    assert main(["impact", "--num-envs", "16", "--threads", "1", "--worlds", "--json", str(out)]) == 0
-    result = json.loads(out.read_text())
-    worlds, stood = result["worlds"], torch.tensor(result["worlds"]["stood"]).bool()
-    assert int((~stood).sum()) == result["num_falls"]
-    for name in ("e_torso", "e_ee_hit", "j_upper"):
-        values = torch.tensor(worlds[name], dtype=torch.float64)
-        assert float(values.mean()) == pytest.approx(result["metrics"][name]["mean"], rel=1e-5)
-        assert float(values[stood].mean()) == pytest.approx(result["metrics_without_falls"][name]["mean"], rel=1e-5)
+def test_every_envs_figures_are_those_behind_the_means():
+    protocol = Impact(num_envs=3, worlds=True)
+    t = trajectory(steps=200, envs=3)
+    t.hand_error[:] = torch.tensor([0.1, 0.2, 0.4])[:, None]
+    t.fell[150, 2] = True
+    env = HumanoidEnv(protocol.configure(HumanoidEnvConfig(num_threads=1)))
+    result = protocol.measure(t, env)
+    assert result["worlds"]["stood"] == [1.0, 1.0, 0.0]
+    assert result["worlds"]["e_ee_hit"] == pytest.approx([0.1, 0.2, 0.4])
+    assert result["worlds"]["recovery_s"][2] is None
+    assert result["metrics"]["e_ee_hit"]["mean"] == pytest.approx(0.7 / 3.0)
+    assert result["metrics_without_falls"]["e_ee_hit"]["mean"] == pytest.approx(0.15)
 
 
 @pytest.mark.parametrize(
@@ -279,14 +297,20 @@ def test_every_worlds_figures_are_those_behind_the_means(tmp_path):
         (["--episode-seconds", "1.5"], "episode_seconds"),
         (["--place", "moon"], "force.place 'moon' is unknown"),
         (["--pelvis", "glued"], "pelvis 'glued' is unknown"),
-        (["--motion", "mixture", "walk"], "stands alone"),
-        (["--arm-pose", "9", "0", "0", "0"], "arm_pose[0]"),
+        (["--motion", "mixture", "walk"], "stand alone"),
+        (["--motion", "none", "walk"], "stand alone"),
+        (["--motion"], "motion must name clips"),
+        (["--motion", "none", "--arm-pose", "9", "0", "0", "0"], "arm_pose[0]"),
+        (["--motion", "none", "--arm-pose", "0", "0", "0"], "arm_pose must have 4 numbers"),
+        (["--arm-pose", "0", "0", "0", "0"], "held only with motion 'none'"),
+        (["--upper-actions", "nobody"], "upper_actions 'nobody' is unknown"),
+        (["--library", "nowhere.npz"], "nowhere.npz"),
         (["--checkpoint", "cotap-gaols"], "'cotap-gaols' does not exist"),
         (["--force", "nan", "0", "0"], "force.force[0]"),
         (["--motion", "moonwalk"], "no clip is called 'moonwalk'"),
     ],
 )
-def test_bad_options_are_named(options, message, capsys):
-    assert main(["impact", *options]) == 2
+def test_bad_options_are_named(options, message, capsys, shipped):  # noqa: ARG001
+    assert main(["impact", "--num-envs", "1", *options]) == 2
     assert message in capsys.readouterr().err
     assert math.isfinite(Impact().seconds)

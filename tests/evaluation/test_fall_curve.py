@@ -1,18 +1,20 @@
-"""Fall rate against impulse: known curves, and the blows that worlds are given."""
+"""Fall rate against impulse: known curves, and the pushes that envs are given."""
 
 from __future__ import annotations
+
+import json
 
 import pytest
 import torch
 
-from cotap.envs import H1Env, H1EnvConfig
+from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.evaluate import main
 from cotap.evaluation.fall_curve import FallCurve, half_point
 
 IMPULSES = torch.linspace(0.0, 60.0, 13)
 
 
-def worlds(rate: torch.Tensor, each: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+def envs(rate: torch.Tensor, each: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
     level = torch.arange(13).repeat(each)
     fell = torch.rand(13 * each, generator=torch.Generator().manual_seed(seed)) < rate[level]
     return level, fell
@@ -28,31 +30,44 @@ def test_half_point_by_hand():
 
 def test_the_interval_covers_the_true_half_point():
     rate = torch.sigmoid((IMPULSES - 33.0) / 4.0)
-    found = half_point(IMPULSES, *worlds(rate, 100))
+    found = half_point(IMPULSES, *envs(rate, 100))
     low, high = found["ci95"]
     assert low < 33.0 < high
     assert high - low < 4.0
-    noisy = [half_point(IMPULSES, *worlds(rate, 30, seed), resamples=200)["ci95"] for seed in range(40)]
+    noisy = [half_point(IMPULSES, *envs(rate, 30, seed), resamples=200)["ci95"] for seed in range(40)]
     assert sum(low <= 33.0 <= high for low, high in noisy) >= 34
 
 
 def test_what_is_not_reached_is_null_with_a_reason():
-    none = half_point(IMPULSES, *worlds(torch.full((13,), 0.1), 50))
+    none = half_point(IMPULSES, *envs(torch.full((13,), 0.1), 50))
     assert none["mean"] is None
     assert "fewer than half" in none["reason"]
-    always = half_point(IMPULSES, *worlds(torch.ones(13), 5))
+    always = half_point(IMPULSES, *envs(torch.ones(13), 5))
     assert always["mean"] is None
-    assert "without a blow" in always["reason"]
+    assert "without a push" in always["reason"]
 
 
-def test_every_world_takes_the_impulse_it_is_counted_under():
-    protocol = FallCurve(num_envs=13, force=(0.0, 3.0, 4.0), randomize=False)
-    env = H1Env(protocol.configure(H1EnvConfig(num_threads=1)))
+@pytest.mark.parametrize("place", ["hand", "base"])
+def test_every_env_takes_the_impulse_it_is_counted_under(robot, place):
+    protocol = FallCurve(num_envs=13, force=(0.0, 3.0, 4.0), place=place, impulse=60.0, levels=13, motion=("none",))
+    env = HumanoidEnv(protocol.configure(HumanoidEnvConfig(robot, num_threads=1)))
     protocol.prepare(env)
     env.reset()
     times = 0.02 * torch.arange(200)
-    impulse = torch.stack([env.scripted.at(torch.full((13,), float(s)))[:, 0] for s in times]).sum(0) * 0.02
+    where = 0 if place == "hand" else -1
+    impulse = torch.stack([env.forces.scripted.at(torch.full((13,), float(s)))[:, where] for s in times]).sum(0) * 0.02
     torch.testing.assert_close(impulse.norm(dim=1), IMPULSES, atol=0.01, rtol=1e-3)
+
+
+def test_the_command_prints_the_curve(checkpoint, tmp_path, capsys):
+    arguments = ["--num-envs", "6", "--levels", "3", "--mode", "walking", "--place", "base", "--threads", "1",
+                 "--json", str(tmp_path / "out.json"), "--plot", str(tmp_path / "p.png")]  # fmt: skip
+    assert main(["fall-curve", "--checkpoint", str(checkpoint), *arguments]) == 0
+    result = json.loads((tmp_path / "out.json").read_text())
+    assert result["fall_curve"]["impulse"] == [0.0, 37.5, 75.0]
+    assert result["arms"] == "moving"
+    assert "fall-curve, pd, arms moving: " in capsys.readouterr().out
+    assert (tmp_path / "p.png").stat().st_size > 5000
 
 
 @pytest.mark.parametrize(

@@ -7,10 +7,11 @@ import json
 import pytest
 import torch
 
-from cotap.envs import H1Env, H1EnvConfig
+from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.evaluate import main
-from cotap.evaluation.fidelity import Fidelity, FidelityResult, conditions, measure, plot, shipped_poses, summary, table
+from cotap.evaluation.fidelity import Fidelity, FidelityResult, conditions, library_poses, measure, plot, summary, table
 from cotap.evaluation.law_options import LawOptions
+from cotap.evaluation.rollout import idle
 
 
 def result(**changes: torch.Tensor) -> FidelityResult:
@@ -38,10 +39,10 @@ def test_errors_by_hand():
     out = summary(result(unholdable=torch.tensor([False, False, True, True, False, False])), 0.8,
                   Fidelity(stiffness_levels=(200.0,)))  # fmt: skip
     assert out["fidelity"][1]["error"] is None
-    assert out["fidelity"][1]["reason"] == "no world was counted"
+    assert out["fidelity"][1]["reason"] == "no env was counted"
     assert out["largest_error"] == 0.0  # of what was measured
     assert out["num_unholdable"] == 2
-    content = out | {"num_falls": 1, "num_envs": 6, "method": "cotap"}
+    content = out | {"num_falls": 1, "num_envs": 6, "protocol": "fidelity", "method": "cotap", "arms": "held"}
     assert "| y | 200 | - |" in table(content)
 
 
@@ -58,7 +59,7 @@ def test_hands_that_go_against_the_load_are_counted_and_shown(tmp_path):
     assert mean["reason"].startswith("2 of 5 hands")
     # Errors 0, 1/3, 1 and two without bound.
     assert out["error_quantiles"] == {"50": pytest.approx(1.0), "95": None}
-    content = out | {"num_falls": 1, "num_envs": 6, "method": "cotap"}
+    content = out | {"num_falls": 1, "num_envs": 6, "protocol": "fidelity", "method": "cotap", "arms": "held"}
     json.dumps(content, allow_nan=False)
     assert "| x | 200 | - | the hand did not go where the load is | 2 | 1 |" in table(content)
     assert "2 hands did not go where the load is" in table(content)
@@ -70,7 +71,7 @@ def test_condition_numbers_are_those_of_mujocos_jacobian(model, spec):
     import mujoco
     import numpy as np
 
-    poses = shipped_poses(spec)[::2000]
+    poses = library_poses(spec)[::2000]
     found = conditions(poses, spec)
     data = mujoco.MjData(model)
     for i, pose in enumerate(poses.numpy()):
@@ -88,10 +89,11 @@ def test_condition_numbers_are_those_of_mujocos_jacobian(model, spec):
 
 @pytest.mark.parametrize(("error", "allowed"), [("joint", 0.12), ("task", 0.02)])
 def test_arms_alone_are_as_stiff_as_they_are_asked_to_be(error, allowed):
-    protocol = Fidelity(poses=2, stiffness_levels=(300.0,), displacement=0.01, pelvis="fixed")
-    cfg = protocol.configure(H1EnvConfig(num_threads=1))
+    protocol = Fidelity(num_envs=6, stiffness_levels=(300.0,), displacement=0.01, pelvis="fixed")
+    cfg = protocol.configure(HumanoidEnvConfig(num_threads=1))
     cfg.upper_body = LawOptions(method="cotap", error=error).configure()
-    found, coverage = measure(H1Env(cfg), protocol, None)
+    env = HumanoidEnv(cfg)
+    found, coverage = measure(env, protocol, idle(env))
     assert 0.3 < coverage <= 1.0
     assert found.counted.sum() >= 4
     out = summary(found, coverage, protocol)
@@ -100,10 +102,11 @@ def test_arms_alone_are_as_stiff_as_they_are_asked_to_be(error, allowed):
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [(["--displacement", "0.2"], "displacement"), (["--poses", "0"], "poses"), (["--method", "pd"], "fidelity needs"),
-     (["--stiffness-levels", "0"], "stiffness_levels[0]"), (["--hand", "both"], "hand 'both' is unknown"),
-     (["--condition", "1.0"], "no pose")],
+    [(["--displacement", "0.2"], "displacement"), (["--num-envs", "0"], "num_envs"),
+     (["--method", "pd"], "fidelity needs"),
+     (["--library", "nowhere.npz"], "nowhere.npz"), (["--stiffness-levels", "0"], "stiffness_levels[0]"),
+     (["--hand", "both"], "hand 'both' is unknown"), (["--condition", "1.0"], "no pose")],
 )  # fmt: skip
-def test_bad_options_are_named(options, message, capsys):
-    assert main(["fidelity", *(["--poses", "1"] if "--poses" not in options else []), *options]) == 2
+def test_bad_options_are_named(options, message, capsys, shipped):  # noqa: ARG001
+    assert main(["fidelity", *(["--num-envs", "1"] if "--num-envs" not in options else []), *options]) == 2
     assert message in capsys.readouterr().err

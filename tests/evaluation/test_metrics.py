@@ -19,34 +19,33 @@ from cotap.evaluation.metrics import (
     tracking_slopes,
 )
 from cotap.evaluation.report import table
-from cotap.evaluation.rollout import Trajectory
+from cotap.evaluation.rollout import Trajectory, idle, record_rollout
 
 DT = 0.02
 
 
-def trajectory(steps: int = 200, worlds: int = 2, **changes: torch.Tensor) -> Trajectory:
+def trajectory(steps: int = 200, envs: int = 2, **changes: torch.Tensor) -> Trajectory:
     """Everyone walks at exactly the command (0.5, -0.2, 0.3), both feet on the ground; `changes` replace fields."""
-    command = torch.tensor([0.5, -0.2, 0.3]).expand(steps, worlds, 3).clone()
+    command = torch.tensor([0.5, -0.2, 0.3]).expand(steps, envs, 3).clone()
     fields = {
         "velocity": command.clone(),
         "command": command,
-        "stand": torch.zeros(steps, worlds, dtype=torch.bool),
-        "told_to_stand": torch.zeros(steps, worlds, dtype=torch.bool),
-        "height": torch.full((steps, worlds), 1.0),
-        "height_command": torch.full((steps, worlds), 1.0),
-        "position": torch.zeros(steps, worlds, 2),
-        "arm_error": torch.zeros(steps, worlds, 8),
-        "arm_velocity": torch.zeros(steps, worlds, 8),
-        "arm_torque": torch.zeros(steps, worlds, 8),
-        "arm_at_limit": torch.zeros(steps, worlds, dtype=torch.bool),
-        "arm_static_torque": torch.zeros(steps, worlds, 8),
-        "hand_offset": torch.zeros(steps, worlds, 2, 3),
-        "hand_error": torch.zeros(steps, worlds, 2),
-        "foot_contact": torch.ones(steps, worlds, 2, dtype=torch.bool),
-        "foot_speed": torch.zeros(steps, worlds, 2),
-        "foot_height": torch.zeros(steps, worlds, 2),
-        "path_error": torch.full((steps, worlds), math.nan),
-        "fell": torch.zeros(steps, worlds, dtype=torch.bool),
+        "stand": torch.zeros(steps, envs, dtype=torch.bool),
+        "height": torch.full((steps, envs), 1.0),
+        "height_command": torch.full((steps, envs), 1.0),
+        "position": torch.zeros(steps, envs, 2),
+        "arm_error": torch.zeros(steps, envs, 8),
+        "arm_velocity": torch.zeros(steps, envs, 8),
+        "arm_torque": torch.zeros(steps, envs, 8),
+        "arm_at_limit": torch.zeros(steps, envs, dtype=torch.bool),
+        "arm_static_torque": torch.zeros(steps, envs, 8),
+        "hand_offset": torch.zeros(steps, envs, 2, 3),
+        "hand_error": torch.zeros(steps, envs, 2),
+        "foot_contact": torch.ones(steps, envs, 2, dtype=torch.bool),
+        "foot_speed": torch.zeros(steps, envs, 2),
+        "foot_height": torch.zeros(steps, envs, 2),
+        "path_error": torch.full((steps, envs), math.nan),
+        "fell": torch.zeros(steps, envs, dtype=torch.bool),
         "film": torch.zeros(0, 0),
     }
     return Trajectory(dt=DT, **(fields | changes))
@@ -99,14 +98,54 @@ def test_errors_are_taken_only_once_a_command_has_settled():
     assert ok[:, 0].nonzero().squeeze(1).tolist() == [*range(50, 100), *range(150, 200)]
 
 
-def test_the_lag_behind_a_height_that_moves_is_measured():
-    """0.2 m down in 40 steps, followed five steps late; velocity and stand hold all the while."""
-    t = trajectory(worlds=1)
-    ramp = 1.0 - 0.005 * torch.arange(-100, 100).clamp(0, 40)
-    t.height_command[:, 0] = ramp
-    t.height[5:, 0] = ramp[:-5]
-    # Each of the 40 steps of 5 mm is made up for five steps later; 150 of 200 steps are measured.
-    assert tracking_measures(t, 0.8)["e_height"][0] == pytest.approx(40 * 0.005 * 5 / 150, rel=1e-3)
+def test_a_height_has_time_to_change():
+    """0.2 m down, reached in 1.4 s and no sooner; from 1.5 s on all that is off counts, whatever velocities do."""
+    t = trajectory(envs=2)
+    t.height_command[100:] = 0.8
+    t.height[170:] = 0.8
+    t.height[:, 1] -= 0.03
+    t.command[100:, :, 0] = 0.1
+    assert tracking_measures(t, 0.8)["e_height"].tolist() == pytest.approx([0.0, 0.03], abs=1e-6)
+
+
+def test_a_robot_that_ignores_its_command_is_seen_to():
+    """It is asked to walk at 0.5 m/s and to turn at 0.3 rad/s, or to stand 0.2 m lower, and sways where it is."""
+    t = trajectory(envs=3)
+    t.velocity.zero_()
+    t.command[...] = torch.tensor([0.5, 0.0, 0.3])
+    t.command[:, 1, 0] = -0.5
+    t.command[:, 2], t.stand[:, 2], t.height_command[:, 2] = 0.0, True, 0.8
+    t.velocity[:, 2, 0] = 0.3
+    t.foot_contact[::2, :, 0] = False
+    m = tracking_measures(t, 0.8)
+    expected = {"e_lin": [0.5, 0.5, 0.3], "e_lin_gait": [0.5, 0.5, 0.3], "e_yaw": [0.3, 0.3, 0.0],
+                "e_yaw_gait": [0.3, 0.3, 0.0], "e_height": [0.0, 0.0, 0.2]}  # fmt: skip
+    for name, values in expected.items():
+        assert m[name].tolist() == pytest.approx(values, abs=1e-5), name
+    assert tracking_slopes(t, 0.8)["slope_x"] == pytest.approx(0.0, abs=1e-6)
+    assert float(m["stand_drift"][2]) == pytest.approx(0.3)
+    assert float(m["still_share"][2]) == 0.0
+    t.velocity.zero_()  # it no longer moves, and steps in place
+    assert float(tracking_measures(t, 0.8)["still_share"][2]) == pytest.approx(0.5, abs=0.01)
+    assert m["still_share"][:2].isnan().all()
+
+
+@pytest.mark.parametrize("asked", ["walk", "stand"])
+def test_an_env_whose_policy_ignores_what_is_asked(make_env, robot, asked):
+    """Asked to walk at 0.5 m/s, to stand 0.1 m lower: recorded is what was asked from the first step on."""
+    env = make_env(2, robot=robot, fixed_base=True)
+    n, stands = env.num_envs, asked == "stand"
+    velocity = torch.tensor([0.0 if stands else 0.5, 0.0]).repeat(n, 1)
+    height = torch.full((n,), env.spec.nominal_height_m - 0.1)
+    env.commands.override(velocity, torch.zeros(n), torch.full((n,), float(stands)), height)
+    t = record_rollout(env, idle(env), 150, progress=False)
+    assert torch.equal(t.command[:, :, :2], velocity.expand(150, n, 2))
+    assert torch.equal(t.height_command, height.expand(150, n))
+    assert (t.stand == stands).all()
+    m = tracking_measures(t, env.cfg.gait.period_s)
+    assert m["e_lin_gait"].tolist() == pytest.approx([0.0 if stands else 0.5] * n, abs=0.02)
+    torch.testing.assert_close(m["e_height"], (t.height - height)[-1], atol=0.01, rtol=0)
+    assert m["still_share"].tolist() == [0.0] * n if stands else m["still_share"].isnan().all()  # feet in the air
 
 
 def test_measures_end_with_the_fall_and_never_include_what_follows():
@@ -123,25 +162,24 @@ def test_measures_end_with_the_fall_and_never_include_what_follows():
 
 def test_stand_drift_is_the_mean_velocity_not_the_sway():
     standing = torch.ones(200, 2, dtype=torch.bool)
-    t = trajectory(command=torch.zeros(200, 2, 3), stand=standing, told_to_stand=standing)
+    t = trajectory(command=torch.zeros(200, 2, 3), stand=standing)
     t.velocity.zero_()
     t.velocity[:, 0, 1] = 0.04
     t.velocity[:, 1, 0] = 0.2 * torch.sin(2.0 * math.pi * torch.arange(200) / 40)
     assert tracking_measures(t, 0.8)["stand_drift"].tolist() == pytest.approx([0.04, 0.0], abs=1e-5)
 
 
-def test_who_steps_although_told_to_stand_is_counted():
-    """Told at 1 s; counted from 2.8 s to the end at 4 s. World 0 steps from 3.4 s on and moves; world 1 stands."""
-    told, stand = torch.zeros(200, 2, dtype=torch.bool), torch.zeros(200, 2, dtype=torch.bool)
-    told[50:] = stand[50:] = True
-    stand[170:, 0] = False
-    t = trajectory(command=torch.zeros(200, 2, 3), stand=stand, told_to_stand=told)
+def test_who_stands_still_when_asked_to_is_counted():
+    """Asked at 1 s; counted from 2.8 s to the end at 4 s. Env 0 lifts a foot from 3.4 s on; env 1 moves too fast."""
+    t = trajectory(envs=3, command=torch.zeros(200, 3, 3))
+    t.stand[50:] = True
     t.velocity.zero_()
-    t.velocity[:, 0, 0] = 0.1
+    t.velocity[:, 1, 1] = 0.11
+    t.foot_contact[170:, 0, 1] = False
     m = tracking_measures(t, 0.8)
-    assert m["stand_share"].tolist() == pytest.approx([0.5, 1.0])
-    assert m["stand_drift"].tolist() == pytest.approx([0.1, 0.0], abs=1e-5)
-    assert tracking_measures(trajectory(), 0.8)["stand_share"].isnan().all()
+    assert m["still_share"].tolist() == pytest.approx([0.5, 0.0, 1.0])
+    assert m["stand_drift"].tolist() == pytest.approx([0.0, 0.11, 0.0], abs=1e-5)
+    assert tracking_measures(trajectory(), 0.8)["still_share"].isnan().all()
 
 
 def test_slip_counts_only_feet_in_contact():
@@ -175,7 +213,7 @@ def test_slopes_are_those_of_least_squares():
     everything = torch.ones(500, dtype=torch.bool)
     assert slope(commanded, measured, everything) == pytest.approx(expected, rel=1e-4)
     assert math.isnan(slope(torch.ones(500), measured, everything))
-    t = trajectory(worlds=3)
+    t = trajectory(envs=3)
     t.command[..., 0] = torch.tensor([-1.0, 0.0, 1.0])
     t.velocity[..., 0] = 0.8 * t.command[..., 0]
     assert tracking_slopes(t, 0.8)["slope_x"] == pytest.approx(0.8, rel=1e-4)
@@ -229,8 +267,17 @@ def test_what_cannot_be_measured_is_null_with_a_reason():
     s = summarize(torch.tensor([math.nan]))
     assert s["mean"] is None
     assert s["reason"]
-    result = {"protocol": "p", "method": "m", "num_falls": 0, "num_envs": 1, "seconds": 1.0, "metrics": {"e_lin": s}}
-    assert "no world" in table(result)
+    result = {
+        "protocol": "p",
+        "method": "m",
+        "arms": "held",
+        "num_falls": 0,
+        "num_envs": 1,
+        "seconds": 1.0,
+        "metrics": {"e_lin": s},
+    }
+    assert "no env" in table(result)
+    assert "p, m, arms held: 0 of 1 envs fell" in table(result)
     json.dumps(s, allow_nan=False)
 
 

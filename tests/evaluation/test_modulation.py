@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from cotap.envs import H1Env, H1EnvConfig
+from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.evaluate import main
 from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.modulation import Modulation, sweep
@@ -19,10 +19,10 @@ def test_sweep_by_hand():
 
 
 def test_every_arm_goes_through_the_whole_range():
-    protocol = Modulation(num_envs=4, pelvis="fixed", window=(0.0, 2.5), episode_seconds=3.5, randomize=False)
-    cfg = protocol.configure(H1EnvConfig(num_threads=1))
+    protocol = Modulation(num_envs=4, pelvis="fixed", window=(0.0, 2.5), fall_seconds=2.5, episode_seconds=3.5)
+    cfg = protocol.configure(HumanoidEnvConfig(num_threads=1))
     cfg.upper_body = LawOptions(method="cotap").configure()
-    env = H1Env(cfg)
+    env = HumanoidEnv(cfg)
     protocol.prepare(env)
     seen = []
 
@@ -51,6 +51,6 @@ def test_every_arm_goes_through_the_whole_range():
      (["--method", "soft-pd"], "got soft-pd, soft-pd"), (["--left", "pd", "--right", "soft-pd"], "got pd, soft-pd"),
      (["--stiffness-range", "0", "5"], "stiffness_range[0]"), (["--alpha-range", "0", "2"], "alpha_range[1]")],
 )  # fmt: skip
-def test_bad_options_are_named(options, message, capsys):
+def test_bad_options_are_named(options, message, capsys, shipped):  # noqa: ARG001
     assert main(["modulation", "--num-envs", "1", *options]) == 2
     assert message in capsys.readouterr().err

@@ -8,7 +8,7 @@ import pytest
 import torch
 from test_metrics import DT, trajectory
 
-from cotap.envs import H1Env, H1EnvConfig
+from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.evaluate import main
 from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.periodic import PeriodicLoad, amplitude, elbow_joints, swing_measures
@@ -26,7 +26,7 @@ def test_amplitude_is_that_of_its_frequency_alone():
 def test_swing_measures_by_hand(spec):
     elbows = elbow_joints(spec)
     assert [spec.upper_joints[i] for i in elbows] == ["left_elbow", "right_elbow"]
-    t = trajectory(steps=450, worlds=2)
+    t = trajectory(steps=450, envs=2)
     wave = (2.0 * math.pi * DT / 4.0 * torch.arange(450)).sin()
     t.arm_torque[:, :, elbows[0]] = 2.0 + 3.0 * wave.unsqueeze(1)
     t.arm_torque[:, :, elbows[1]] = 6.0 * wave.unsqueeze(1)
@@ -47,9 +47,9 @@ def test_swing_measures_by_hand(spec):
 def test_a_slow_load_asks_for_the_same_torque_whatever_the_stiffness():
     """Fixed pelvis, compliant left arm, PD on the right: torques are those of statics, the left hand swings more."""
     protocol = PeriodicLoad(num_envs=1, pelvis="fixed", randomize=False, force=(0.0, 0.0, 10.0), periods=2)
-    cfg = protocol.configure(H1EnvConfig(num_threads=1))
+    cfg = protocol.configure(HumanoidEnvConfig(num_threads=1))
     cfg.upper_body = LawOptions(left="cotap:alpha=1,stiffness=400", right="pd").configure()
-    env = H1Env(cfg)
+    env = HumanoidEnv(cfg)
     protocol.prepare(env)
     t = record_rollout(env, idle(env), round(protocol.seconds / env.dt), progress=False)
     m = {k: v["mean"] for k, v in protocol.measure(t, env)["metrics"].items()}

@@ -13,7 +13,7 @@ import torch
 
 from cotap.compliance.interface import LawParameters, LawReport
 from cotap.compliance.laws import LAWS, LawConfig, PDLaw
-from cotap.envs import H1Env, H1EnvConfig
+from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.upper_body import UpperBodyConfig
 from cotap.evaluate import main
 from cotap.evaluation.linearization import linearize
@@ -46,13 +46,13 @@ def test_pd_has_the_eigenvalues_of_mujocos_arm(spec, model, rng, kp):
     q = random_poses(spec, 4, rng)
     found = loop(spec, "soft-pd", q, soft_gain=kp).growth().reshape(4, 2)
     arm = slice(17, 21)
-    for world in range(4):
+    for env in range(4):
         data, dense = mujoco.MjData(model), np.zeros((model.nv, model.nv))
         bias = []
         for joint in (None, 0, 1, 2, 3):
             data.qpos[:] = 0.0
             data.qpos[3] = 1.0
-            data.qpos[18:22] = q[world, 0]
+            data.qpos[18:22] = q[env, 0]
             if joint is not None:
                 data.qpos[18 + joint] += 1e-5
             mujoco.mj_forward(model, data)
@@ -62,7 +62,7 @@ def test_pd_has_the_eigenvalues_of_mujocos_arm(spec, model, rng, kp):
         gravity = np.stack([(b - bias[0]) / 1e-5 for b in bias[1:]], 1)
         inverse, friction = np.linalg.inv(dense[arm, arm]), 2.0 * np.eye(4) + np.diag(model.dof_damping[arm])
         flow = np.block([[np.zeros((4, 4)), np.eye(4)], [-inverse @ (kp * np.eye(4) + gravity), -inverse @ friction]])
-        assert float(found[world, 0]) == pytest.approx(np.linalg.eigvals(flow).real.max(), rel=1e-3)
+        assert float(found[env, 0]) == pytest.approx(np.linalg.eigvals(flow).real.max(), rel=1e-3)
 
 
 def test_what_is_known_of_laws(spec, rng):
@@ -98,9 +98,9 @@ def test_rates_are_counted_per_wall_and_load(spec):
 
 def drawn(name: str) -> dict:
     protocol = Stability(num_envs=6, seconds=1.5, settle_seconds=4.0, frequency=(1.0, 4.0))
-    cfg = protocol.configure(H1EnvConfig(num_threads=1))
+    cfg = protocol.configure(HumanoidEnvConfig(num_threads=1))
     cfg.upper_body = UpperBodyConfig(LawConfig(name), LawConfig(name))
-    return energy_summary(exchanged_energy(H1Env(cfg), protocol))
+    return energy_summary(exchanged_energy(HumanoidEnv(cfg), protocol))
 
 
 def test_energy_is_drawn_from_what_is_active_and_from_nothing_else(monkeypatch):
@@ -112,7 +112,7 @@ def test_energy_is_drawn_from_what_is_active_and_from_nothing_else(monkeypatch):
 
 
 def test_energy_accounts():
-    """Two worlds: lacks 0.5 J on the way and gains in the end; has diverged."""
+    """Two envs: lacks 0.5 J on the way and gains in the end; has diverged."""
     energy = torch.tensor([[0.0, 0.0], [-0.5, 0.1], [0.7, -math.inf]])
     summary = energy_summary(energy)
     assert summary["constant_stiffness"] == {
@@ -122,12 +122,12 @@ def test_energy_accounts():
     assert summary["changing_stiffness"]["least_energy"] is None
 
 
-def test_the_command_prints_and_writes(tmp_path, capsys):
+def test_the_command_prints_and_writes(checkpoint, tmp_path, capsys):
     out = tmp_path / "stability.json"
-    arguments = ["stability", "--method", "cotap+facet-matched", "--poses", "4", "--num-envs", "2", "--seconds", "0.2",
+    arguments = ["--method", "cotap+facet-matched", "--poses", "4", "--num-envs", "2", "--seconds", "0.2",
                  "--settle-seconds", "0.2", "--threads", "1", "--json", str(out),
                  "--plot", str(tmp_path / "stability.png")]  # fmt: skip
-    assert main(arguments) == 0
+    assert main(["stability", "--checkpoint", str(checkpoint), *arguments]) == 0
     content = json.loads(out.read_text())
     assert len(content["linearised"]) == 8
     assert content["energy"]["changing_stiffness"]["trials"] == 1
@@ -135,14 +135,14 @@ def test_the_command_prints_and_writes(tmp_path, capsys):
     assert "largest real part" in capsys.readouterr().out
 
 
-def test_without_the_ratio_both_halves_are_without_it(spec, tmp_path):
+def test_without_the_ratio_both_halves_are_without_it(spec, checkpoint, tmp_path):
     """Poses beyond a condition number of 2 are most: the ratio and its absence make different loops."""
     law = "cotap:condition_threshold=2"
-    arguments = ["stability", "--left", law, "--right", law, "--no-singularity-ratio", "--poses", "8", "--num-envs",
+    arguments = ["--left", law, "--right", law, "--singularity-ratio", "False", "--poses", "8", "--num-envs",
                  "2", "--seconds", "0.1", "--settle-seconds", "0.1", "--threads", "1", "--json"]  # fmt: skip
-    assert main([*arguments, str(tmp_path / "out.json")]) == 0
+    assert main(["stability", "--checkpoint", str(checkpoint), *arguments, str(tmp_path / "out.json")]) == 0
     content = json.loads((tmp_path / "out.json").read_text())
-    left = LawConfig("cotap", null_stiffness=25.0, condition_threshold=2.0)
+    left = LawConfig("cotap", condition_threshold=2.0)
     never = replace(left, condition_threshold=math.inf)
     assert content["linearised"] == growth_rates(spec, never, Stability(poses=8))
     assert content["linearised"] != growth_rates(spec, left, Stability(poses=8))

@@ -7,10 +7,13 @@ import json
 import pytest
 import torch
 
-from cotap.envs import H1Env, H1EnvConfig
+from cotap.compliance.laws import LawConfig
+from cotap.envs import HumanoidEnv, HumanoidEnvConfig
+from cotap.envs.upper_body import UpperBodyConfig
 from cotap.evaluate import main
 from cotap.evaluation.law_options import LawOptions, parse_law
-from cotap.evaluation.static import StaticStiffness, measure
+from cotap.evaluation.rollout import idle
+from cotap.evaluation.static import StaticResult, StaticStiffness, measure
 
 # Condition numbers of the hand's Jacobian up to 5.
 POSES = [
@@ -23,10 +26,21 @@ POSES = [
 
 
 def run(pose, stiffness, force, **laws):
-    protocol = StaticStiffness(force=force, levels=2, arm_pose=pose, settle_seconds=12.0)
-    cfg = protocol.configure(H1EnvConfig(num_threads=1))
-    cfg.upper_body = LawOptions(method="cotap", stiffness=(stiffness,), **laws).configure()
-    return measure(H1Env(cfg), protocol, None)
+    protocol = StaticStiffness(num_envs=2, force=force, levels=2, arm_pose=pose, settle_seconds=12.0)
+    return measured(protocol, LawOptions(method="cotap", stiffness=(stiffness,), **laws))
+
+
+def prepared(protocol, laws) -> HumanoidEnv:
+    cfg = protocol.configure(HumanoidEnvConfig(num_threads=1))
+    cfg.upper_body = laws.configure()
+    env = HumanoidEnv(cfg)
+    protocol.prepare(env)
+    return env
+
+
+def measured(protocol, laws) -> StaticResult:
+    env = prepared(protocol, laws)
+    return measure(env, protocol, idle(env))
 
 
 STIFFNESSES = (100.0, 300.0, 500.0, 800.0, 1000.0)
@@ -36,18 +50,16 @@ STIFFNESSES = (100.0, 300.0, 500.0, 800.0, 1000.0)
 @pytest.mark.parametrize(("error", "allowed"), [("joint", 0.05), ("task", 0.01)])
 @pytest.mark.parametrize("pose", POSES)
 def test_effective_stiffness_is_the_commanded_one(pose, error, allowed):
-    """Every stiffness along every axis, in worlds of their own, under loads that move the hand by 5 mm."""
+    """Every stiffness along every axis, in envs of their own, under loads that move the hand by 5 mm."""
     cases = [(axis, k) for axis in range(3) for k in STIFFNESSES]
-    # World 0 has no load; world i has its own, which `measure` scales by i / 15.
-    protocol = StaticStiffness(force=(1.0, 1.0, 1.0), levels=16, arm_pose=pose, settle_seconds=12.0)
-    cfg = protocol.configure(H1EnvConfig(num_threads=1))
-    cfg.upper_body = LawOptions(method="cotap", error=error).configure()
-    env = H1Env(cfg)
-    env.scripted.amplitude_h[:] = 0.0
+    # Env 0 has no load; env i has its own.
+    protocol = StaticStiffness(num_envs=16, force=(1.0, 1.0, 1.0), levels=16, arm_pose=pose, settle_seconds=12.0)
+    env = prepared(protocol, LawOptions(method="cotap", error=error, null_stiffness=25.0))
+    env.forces.scripted.amplitude_h[:] = 0.0
     for i, (axis, k) in enumerate(cases, start=1):
-        env.scripted.amplitude_h[i, 0, axis] = 0.005 * k * 15.0 / i
+        env.forces.scripted.amplitude_h[i, 0, axis] = 0.005 * k
         env.upper_body.parameters.stiffness[i] = k
-    result = measure(env, protocol, None)
+    result = measure(env, protocol, idle(env))
     assert result.condition <= 5.0
     assert not result.saturated
     for i, (axis, k) in enumerate(cases, start=1):
@@ -71,22 +83,22 @@ def test_one_pose_one_axis(error, allowed):
 )
 def test_heavy_load(error, expected):
     """50 N on the left hand, 300 N/m along x and y, elbow at 0.3 rad, no torque limits: as another model of H1 gave."""
+    n = 1 + len(expected)
     protocol = StaticStiffness(
-        force=(0.0, 0.0, -1.0), levels=1 + len(expected), settle_seconds=8.0, torque_limit_scale=100.0
+        num_envs=n, force=(0.0, 0.0, -1.0), levels=n, settle_seconds=8.0, torque_limit_scale=100.0, arm_pose=POSES[0]
     )
-    cfg = protocol.configure(H1EnvConfig(num_threads=1))
-    cfg.upper_body = LawOptions(method="cotap", stiffness=(300.0,), error=error).configure()
-    env = H1Env(cfg)
+    env = prepared(protocol, LawOptions(method="cotap", stiffness=(300.0,), error=error, null_stiffness=25.0))
     for i, vertical in enumerate(expected, start=1):
-        env.scripted.amplitude_h[i, 0, 2] = -50.0 * len(expected) / i  # `measure` scales world i by i / worlds
+        env.forces.scripted.amplitude_h[i, 0, 2] = -50.0
         env.upper_body.parameters.stiffness[i, ..., 2] = vertical
-    moved = measure(env, protocol, None).displacement[1:, 2]
+    moved = measure(env, protocol, idle(env)).displacement[1:, 2]
     assert moved.tolist() == pytest.approx(list(expected.values()), rel=0.01)
 
 
-def test_an_asked_for_table_by_axis(tmp_path, capsys):
+def test_an_asked_for_table_by_axis(checkpoint, tmp_path, capsys):
     out = tmp_path / "static.json"
-    arguments = ["static-stiffness", "--method", "cotap", "--stiffness", "200", "400", "800", "--error", "task",
+    arguments = ["static-stiffness", "--checkpoint", str(checkpoint), "--num-envs", "4", "--arm-pose", "0", "0", "0",
+                 "0.3", "--method", "cotap", "--stiffness", "200", "400", "800", "--error", "task",
                  "--force", "1", "-2", "4", "--levels", "3", "--threads", "1", "--json", str(out),
                  "--plot", str(tmp_path / "p.png")]  # fmt: skip
     assert main(arguments) == 0
@@ -109,10 +121,18 @@ def test_the_right_arm_is_the_lefts_mirror_image():
 
 
 def run_hand(hand, force):
-    protocol = StaticStiffness(force=force, levels=2, hand=hand, settle_seconds=4.0)
-    cfg = protocol.configure(H1EnvConfig(num_threads=1))
-    cfg.upper_body = LawOptions(method="cotap").configure()
-    return measure(H1Env(cfg), protocol, None)
+    protocol = StaticStiffness(num_envs=2, force=force, levels=2, hand=hand, settle_seconds=4.0)
+    return measured(protocol, LawOptions(method="cotap"))
+
+
+def test_arms_of_any_robot_give_way_to_a_load(robot):
+    protocol = StaticStiffness(num_envs=4, force=(0.0, 0.0, -5.0), levels=2, settle_seconds=3.0)
+    env = HumanoidEnv(protocol.configure(HumanoidEnvConfig(robot, num_threads=1)))
+    protocol.prepare(env)
+    result = protocol.evaluate(env, idle(env))
+    assert result["effective_stiffness"]["commanded"] is None
+    assert result["curve"]["displacement"][0] == pytest.approx([0.0] * 3, abs=1e-4)
+    assert result["displacement"][2] < -0.002
 
 
 def test_arms_have_laws_of_their_own():
@@ -134,6 +154,20 @@ def test_arms_have_laws_of_their_own():
     assert (shared.damping_ratio, shared.reference_share, shared.error) == (0.5, 0.3, "task")
 
 
+def test_arms_are_as_trained_unless_options_say_otherwise():
+    trained = UpperBodyConfig(LawConfig("cotap", null_stiffness=33.0, damping="pd"), LawConfig("cotap", alpha=0.3))
+    trained.torso.model, trained.singularity_ratio, trained.sampling.enabled = "constant", False, True
+    kept = LawOptions().configure(trained)
+    assert (kept.left, kept.right) == (trained.left, trained.right)
+    assert (kept.torso.model, kept.singularity_ratio, kept.sampling.enabled) == ("constant", False, False)
+    changed = LawOptions(stiffness=(500.0,), torso_compliance="none", singularity_ratio=True).configure(trained)
+    assert (changed.left.stiffness, changed.left.null_stiffness) == ((500.0,) * 3, 33.0)
+    assert (changed.torso.model, changed.singularity_ratio) == ("none", True)
+    assert LawOptions("cotap").configure(UpperBodyConfig()).left == LawConfig("cotap")  # trained under PD
+    assert LawOptions("facet").configure(trained).right == LawConfig("facet")
+    assert LawOptions(left="cotap:alpha=0.5").configure(trained).left.damping == "pd"
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -150,8 +184,10 @@ def test_arms_have_laws_of_their_own():
         (["--pelvis", "glued"], "pelvis 'glued' is unknown"),
         (["--hand", "both"], "hand 'both' is unknown"),
         (["--levels", "1"], "levels must lie in"),
+        (["--num-envs", "5"], "num_envs must be at least levels"),
+        (["--arm-pose", "0", "0"], "arm_pose must have 4 numbers"),
     ],
 )
-def test_bad_options_are_named(arguments, message, capsys):
+def test_bad_options_are_named(arguments, message, capsys, shipped):  # noqa: ARG001
     assert main(["static-stiffness", *arguments]) == 2
     assert message in capsys.readouterr().err

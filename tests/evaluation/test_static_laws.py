@@ -6,15 +6,16 @@ import mujoco
 import numpy as np
 import pytest
 
-from cotap.envs import H1Env, H1EnvConfig
+from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.evaluation.law_options import LawOptions
+from cotap.evaluation.rollout import idle
 from cotap.evaluation.static import StaticStiffness, measure
 
 LOAD, STIFFNESS, WEIGHT = (1.0, -1.0, -2.0), np.array([500.0, 300.0, 400.0]), 0.6
 ARM = slice(11, 15)
 
 
-def springs(env: H1Env) -> tuple[np.ndarray, np.ndarray]:
+def springs(env: HumanoidEnv) -> tuple[np.ndarray, np.ndarray]:
     """MuJoCo's own Jacobian (3, 4) of the left hand and stiffness (4, 4) of gravity, at the pose without a load."""
     model, data = env.sim.model, mujoco.MjData(env.sim.model)
     start = env.sim.qpos[0].numpy().copy()
@@ -33,7 +34,7 @@ def springs(env: H1Env) -> tuple[np.ndarray, np.ndarray]:
     return jacobian[:, 6 + ARM.start : 6 + ARM.stop], gravity
 
 
-def predicted(law: str, env: H1Env) -> np.ndarray:
+def predicted(law: str, env: HumanoidEnv) -> np.ndarray:
     """Displacement (3,) of springs in series: the arm's under its own law, and the reference's."""
     j, gravity = springs(env)
     rigid = np.linalg.inv(np.diag(STIFFNESS))
@@ -53,11 +54,12 @@ def predicted(law: str, env: H1Env) -> np.ndarray:
 
 @pytest.mark.parametrize("law", ["pd", "soft-pd", "cotap", "facet", "cotap+facet", "cotap+facet-matched", "hmc", "dcc"])
 def test_static_displacement_is_what_the_springs_add_up_to(law):
-    protocol = StaticStiffness(force=LOAD, levels=2, settle_seconds=2.0)
-    cfg = protocol.configure(H1EnvConfig(num_threads=1))
+    protocol = StaticStiffness(num_envs=2, force=LOAD, levels=2, settle_seconds=2.0, arm_pose=(0.0, 0.0, 0.0, 0.3))
+    cfg = protocol.configure(HumanoidEnvConfig(num_threads=1))
     alpha = WEIGHT if law == "hmc" else 1.0
     cfg.upper_body = LawOptions(law, tuple(STIFFNESS.tolist()), alpha=alpha).configure()
-    env = H1Env(cfg)
-    moved = measure(env, protocol, None).displacement[-1].numpy()
+    env = HumanoidEnv(cfg)
+    protocol.prepare(env)
+    moved = measure(env, protocol, idle(env)).displacement[-1].numpy()
     expected = predicted(law, env)
     np.testing.assert_allclose(moved, expected, atol=0.03 * np.abs(expected).max())

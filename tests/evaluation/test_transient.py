@@ -17,13 +17,13 @@ SPEED = 1.5
 DIRECTION = torch.tensor([0.6, -0.8, 0.0])
 
 
-def struck(damping_ratio: float, worlds: int = 1, rate: float = RATE) -> Trajectory:
+def struck(damping_ratio: float, envs: int = 1, rate: float = RATE) -> Trajectory:
     """Left hands that are struck to `SPEED` at the onset, 3 cm from their reference, and swing freely (exact)."""
     time = torch.arange(1, round(SECONDS / DT) + 1, dtype=torch.float64) * DT - ONSET_S
     damped = rate * math.sqrt(abs(1.0 - damping_ratio**2))
     wave = torch.sin(damped * time) if damping_ratio < 1.0 else torch.sinh(damped * time)
     moved = torch.where(time > 0.0, SPEED / damped * torch.exp(-damping_ratio * rate * time) * wave, 0.0)
-    t = replace(trajectory(steps=len(time), worlds=worlds), dt=DT)
+    t = replace(trajectory(steps=len(time), envs=envs), dt=DT)
     t.hand_offset[:, :, 0] = (moved[:, None] * DIRECTION.double() + 0.03).float()[:, None]
     return t
 
@@ -86,7 +86,7 @@ def test_the_blow_itself_is_left_out_and_both_hands_are_averaged():
 
 
 def test_a_world_that_falls_has_no_transient():
-    t = struck(0.2, worlds=3)
+    t = struck(0.2, envs=3)
     onset = round(ONSET_S / DT)
     t.fell[onset + 200, 0] = True
     t.fell[onset + 700, 1] = True

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cotap.envs.reference import ClipConfig, load_clips
 from cotap.motions.library import FPS, MotionClip, shipped_library
 from cotap.motions.pace import pace
+from cotap.motions.reference import ClipConfig, load_clips
 
 SPEED = np.full(2, 100.0)
 

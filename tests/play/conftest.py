@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from random_policy import save_random_policy
 from viser import ViserServer
 
-from cotap.evaluation.policy import shipped_checkpoint
 from cotap.evaluation.recording import Recording
 from cotap.play.forces import Push
 from cotap.play.recorder import Recorder
@@ -17,9 +17,15 @@ from cotap.play.server import open_server
 from cotap.play.session import Session
 
 
+@pytest.fixture(scope="session")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A policy of the H1 that leaves its joints where they are: it stands for a second and a half."""
+    return save_random_policy(tmp_path_factory.mktemp("policy") / "base.pt")
+
+
 @pytest.fixture(scope="module")
-def shared_session() -> Session:
-    return Session({"base": shipped_checkpoint("base"), "missing": Path("nowhere.pt")})
+def shared_session(checkpoint: Path) -> Session:
+    return Session({"base": checkpoint, "missing": Path("nowhere.pt")})
 
 
 @pytest.fixture

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import asyncio
-import re
 import socket
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
+from random_policy import save_random_policy
 from viser import ViserServer
 
-from cotap.evaluation.policy import shipped_checkpoint
 from cotap.evaluation.recording import load_recording
 from cotap.play import ROBOTS
-from cotap.play.__main__ import main
+from cotap.play.__main__ import PlayOptions, _live, main
 from cotap.play.app import App
 from cotap.play.controls import Refused
 from cotap.play.forces import Push
@@ -31,10 +30,8 @@ def scene(server: ViserServer, session: Session) -> Scene:
 
 
 @pytest.fixture
-def app(session, free_port, tmp_path):
-    server = open_server("127.0.0.1", free_port)
-    yield App(server, scene(server, session), session, tmp_path / "out")
-    server.stop()
+def app(session, server, tmp_path):
+    return App(server, scene(server, session), session, tmp_path / "out")
 
 
 def test_mail_reaches_the_simulation_and_bad_mail_does_not(app):
@@ -60,27 +57,27 @@ def test_the_page_shows_what_was_accepted_not_what_was_sent(app):
 
 
 @pytest.fixture
-def told(app, monkeypatch):
-    notices = []
-    monkeypatch.setattr(app.notices, "tell", lambda text, *_, **__: notices.append(text))
-    return notices
+def notices(app, monkeypatch):
+    shown = []
+    monkeypatch.setattr(app.notices, "tell", lambda text, *_, **__: shown.append(text))
+    return shown
 
 
-def test_a_push_is_made_of_what_was_accepted_and_people_are_told_what_was_not(app, told):
+def test_a_push_is_made_of_what_was_accepted_and_notices_say_what_was_not(app, notices):
     shown = app.panel._handles
     for name, sent, used in (
         ("hand", "right", "right"), ("hand", "head", "right"), ("force", 1e9, 600.0), ("force", float("nan"), 600.0),
         ("seconds", 99.0, 5.0), ("seconds", 0.1, 0.1),
     ):  # fmt: skip
-        before = len(told)
+        before = len(notices)
         shown[f"push.{name}"]._impl.value = sent  # as a browser's message does
         app.panel._set(f"push.{name}", sent, None)
         assert shown[f"push.{name}"].value == used
-        assert len(told) - before == (sent != used)
+        assert len(notices) - before == (sent != used)
     assert app.panel._push((0.0, 0.0, -1.0)) == Push("right", (0.0, 0.0, -600.0), 0.1)
 
 
-def test_of_a_drag_out_of_reach_people_are_told_once(app, told):
+def test_a_drag_out_of_reach_gets_one_notice(app, notices):
     def drag(phase, *point):
         event = SimpleNamespace(instance_index=1, phase=phase, end_position=point, client=None)
         asyncio.run(app._drag(event))
@@ -93,20 +90,20 @@ def test_of_a_drag_out_of_reach_people_are_told_once(app, told):
         app.advance()
         assert app.session.values["a.right.drag"] == (1e3, 0.0, 1.0)
         drag("end", 0.0, 0.0, 1.0)
-    assert len(told) == 2
-    assert "drag 1e+09 is outside" in told[0]
+    assert len(notices) == 2
+    assert "drag 1e+09 is outside" in notices[0]
     app.advance()
     assert app.session.values["a.right.drag"] is None
 
 
 @pytest.mark.parametrize("index", [None, -1, 4])
-def test_a_drag_of_no_hand_on_the_page_does_nothing(app, told, index):
+def test_a_drag_of_no_hand_on_the_page_does_nothing(app, notices, index):
     before = dict(app.session.values)
     event = SimpleNamespace(instance_index=index, phase="start", end_position=(0.0, 0.0, 1.0), client=None)
     asyncio.run(app._drag(event))
     app.advance()
     assert app.session.values == before
-    assert not told
+    assert not notices
 
 
 def test_paused_it_stands_still_but_for_single_steps_and_reset_starts_over(app):
@@ -183,42 +180,21 @@ def test_a_checkpoint_that_is_refused_is_shown_as_it_was(app):
     assert app.panel._handles["a.checkpoint"].value == "base"
 
 
-def test_a_page_of_another_robot_than_the_policys_is_refused(session, free_port, tmp_path):
-    server = open_server("127.0.0.1", free_port)
-    try:
-        drawn = scene(server, session)
-        drawn.robot = "g1"
-        with pytest.raises(ValueError, match="shows 'g1', but the policy is of 'h1'"):
-            App(server, drawn, session, tmp_path)
-    finally:
-        server.stop()
-
-
-def test_a_policy_that_was_trained_with_another_gait_runs_and_says_so(free_port, tmp_path, monkeypatch):
-    server = open_server("127.0.0.1", free_port)
-    try:
-        two = Session({name: shipped_checkpoint(name) for name in ("cotap", "facet")})
-        app = App(server, scene(server, two), two, tmp_path)
-        told = []
-        monkeypatch.setattr(app.notices, "tell", lambda text, title: told.append((title, text)))
-        app.advance()
-        assert told == []
-        app.mailbox.set("b.checkpoint", "facet")
-        app.advance()
-        app.mailbox.set("b.checkpoint", "cotap")  # what the environment is made of
-        app.advance()
-    finally:
-        server.stop()
-    ((title, text),) = told
-    assert title == "robot B: another gait"
-    names = (
-        "step_apart_m", "step_clear_m", "step_hold_back_m", "step_catch_lift", "step_roll_damping_s",
-        "step_twist_damping_s", "step_straighten_rad", "waist_yield_s", "waist_damping_s", "step_correct_s",
-    )  # fmt: skip
-    differ = [f"{name} 0.0 (here {getattr(app.session.env.cfg.commands, name)})" for name in names]
-    differ.append("foresee_falls False (here True)")
-    assert text == f"facet was trained with {', '.join(differ)}"
-    assert app.session.num_steps == 3
+def test_a_policy_that_was_trained_with_another_stride_runs_and_a_notice_says_so(
+    server, tmp_path, checkpoint, monkeypatch
+):
+    two = Session({"one": checkpoint, "other": checkpoint})
+    app = App(server, scene(server, two), two, tmp_path)
+    notices = []
+    monkeypatch.setattr(app.notices, "tell", lambda text, title: notices.append((title, text)))
+    app.mailbox.set("b.checkpoint", "other")
+    app.advance()
+    assert notices == []
+    monkeypatch.setattr(two.env.cfg.gait, "period_s", 1.0)
+    app.mailbox.set("b.checkpoint", "one")
+    app.advance()
+    assert notices == [("robot B: another gait", "one was trained with a stride of 0.8 s; here it is 1 s")]
+    assert app.session.num_steps == 2
 
 
 def test_no_browser_is_asked_for_an_environment_map_and_for_shadows_only_when_they_are_wanted(app):
@@ -230,17 +206,6 @@ def test_no_browser_is_asked_for_an_environment_map_and_for_shadows_only_when_th
     assert not last("EnableLightsMessage").cast_shadow
     app.scene.cast_shadows(True)
     assert last("EnableLightsMessage").cast_shadow
-
-
-@pytest.mark.parametrize(
-    ("side_by_side", "braces", "told"),
-    [(False, [True, True], ["A"]), (True, [False, True], ["B"]), (True, [False, False], [])],
-)
-def test_the_head_says_who_stands_because_it_braces_itself(app, side_by_side, braces, told):
-    app.session.set({"side_by_side": side_by_side})
-    app.session.env.load_sense.braces = torch.tensor(braces)
-    app._show_status()
-    assert re.findall(r"robot (\w) braces itself", app.panel.status.content) == told
 
 
 def test_a_simulation_that_fails_ends_the_program_and_says_why(app, monkeypatch):
@@ -260,7 +225,7 @@ def test_the_plot_of_force_over_displacement_takes_loaded_steps_along_the_force(
     assert len(Plots.TITLES) == 5
 
 
-def test_a_taken_port_is_told_with_what_to_do(free_port, capsys):
+def test_of_a_taken_port_the_error_says_what_to_do(free_port, capsys):
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", free_port))
         taken.listen()
@@ -277,7 +242,27 @@ def test_what_cannot_be_shown_is_refused_before_anything_runs(free_port, tmp_pat
     assert main(["--port", str(free_port), "--robot", "atlas"]) == 2
     err = capsys.readouterr().err
     assert "none.npz" in err
+    assert "none.pt" in err
+    assert "robot 'atlas' is unknown" in err
     for option in ("robot", "checkpoint"):
         assert main(["--port", str(free_port), "--replay", str(tmp_path / "none.npz"), f"--{option}", "h1"]) == 2
         assert "leave out --robot and --checkpoint with --replay" in capsys.readouterr().err
-    assert "none.pt" in err
+    assert main(["--port", str(free_port), "--checkpoint", "policy.pt", "--robot", "h1"]) == 2
+    assert "leave out --robot with --checkpoint" in capsys.readouterr().err
+    assert main(["--port", str(free_port), "--robot", "made-up"]) == 2  # nobody trains it
+    assert "no policy of robot 'made-up' is shipped" in capsys.readouterr().err
+
+
+def test_a_checkpoint_brings_its_robot_and_comes_before_the_shipped_policies(server, tmp_path, monkeypatch):
+    path = save_random_policy(tmp_path / "policy.pt", robot="made-up")
+    monkeypatch.setattr("cotap.evaluation.policy.shipped_names", lambda: ["h1-base", "made-up-base", "made-up-cotap"])
+    monkeypatch.setattr("cotap.evaluation.policy.shipped_checkpoint", Path)
+    app = _live(PlayOptions(checkpoint=(str(path),)), server)
+    assert app.session.env.spec.name == "made-up"
+    assert app.session.controls["a.checkpoint"].options == (
+        str(path), "shipped made-up-cotap", "shipped made-up-base",
+    )  # fmt: skip
+    app.advance()
+    app.advance()
+    app.plots.draw(2)
+    app.scene.show(app._latest[1])

@@ -22,8 +22,8 @@ def scene(server, session):
 @pytest.fixture
 def archive(server, tmp_path, monkeypatch):
     archive = Archive(tmp_path, Notices(server))
-    archive.told = []
-    monkeypatch.setattr(archive._notices, "tell", lambda text, *_: archive.told.append(text))
+    archive.notices = []
+    monkeypatch.setattr(archive._notices, "tell", lambda text, *_: archive.notices.append(text))
     return archive
 
 
@@ -73,14 +73,14 @@ def test_a_film_shows_the_robots_of_the_recording_whatever_the_page_shows(archiv
     film = archive.path.with_suffix(".mp4")
     assert browser.downloads == {film.name: film.read_bytes()}
     assert film.read_bytes()[4:8] == b"ftyp"
-    assert archive.told == [f"written to {film}"]
+    assert archive.notices == [f"written to {film}"]
 
 
 def test_a_browser_that_stops_drawing_leaves_no_film_and_the_page_as_it_was(archive, scene, record):
     archive.keep(record(11, 2))
     browser = Browser(archive, scene, fails_after=2)
     archive.film(browser, scene)
-    (text,) = archive.told
+    (text,) = archive.notices
     assert "keep its tab in front" in text
     assert not archive.path.with_suffix(".mp4").exists()
     assert browser.downloads == {}
@@ -91,7 +91,7 @@ def test_a_browser_that_stops_drawing_leaves_no_film_and_the_page_as_it_was(arch
 
 def test_before_anything_is_recorded_there_is_nothing_to_film(archive, scene):
     archive.film(Browser(archive, scene), scene)
-    assert archive.told == ["record something first"]
+    assert archive.notices == ["record something first"]
 
 
 def test_a_sample_of_one_robot_is_drawn_alone_where_two_are_asked_for(scene, record):

@@ -20,7 +20,7 @@ CONTROLS = {
 
 
 @pytest.mark.parametrize(("sent", "used"), [(200, 200.0), (-3.0, 50.0), (1e300, 1500.0)])
-def test_numbers_are_brought_into_their_range_and_told_so(sent, used):
+def test_numbers_are_brought_into_their_range_and_a_notice_says_so(sent, used):
     mailbox = Mailbox(CONTROLS)
     value, notice = mailbox.set("k", sent)
     assert value == used
@@ -85,7 +85,7 @@ def test_pushes_that_cannot_be_are_refused(push):
     assert mailbox.take()[1] == []
 
 
-def test_a_point_out_of_reach_is_moved_and_told_so():
+def test_a_point_out_of_reach_is_moved_and_a_notice_says_so():
     mailbox = Mailbox(CONTROLS)
     assert mailbox.set("drag", (1.0, -2.0, 3.0)) == ((1.0, -2.0, 3.0), None)
     point, notice = mailbox.set("drag", (1.0, 2.0, -1e9))

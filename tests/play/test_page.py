@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from viser._messages import GuiUpdateMessage
 
-from cotap.evaluation.policy import shipped_checkpoint
 from cotap.play import ROBOTS
 from cotap.play.app import App
 from cotap.play.scene import Scene
@@ -68,7 +67,7 @@ class Page:
         return other
 
     def send(self, handle: Any, value: float) -> None:
-        """What a message of the newest viewer does, with a value that no box lets through; all others are told it."""
+        """What a message of the newest viewer does, with a value that no box lets through; all others get it."""
         server = self.app.server
         message = GuiUpdateMessage(handle._impl.uuid, {"value": value})
         handled = server.gui._handle_gui_updates(max(server.get_clients()), message)
@@ -88,11 +87,11 @@ class Page:
 
 
 @pytest.fixture
-def page(free_port: int, tmp_path: Path) -> Iterator[Page]:
+def page(free_port: int, tmp_path: Path, checkpoint: Path) -> Iterator[Page]:
     from playwright.sync_api import sync_playwright
 
     server = open_server("127.0.0.1", free_port)
-    session = Session({"base": shipped_checkpoint("base")})
+    session = Session({"base": checkpoint})
     app = App(server, Scene(server, session.env.spec, len(ROBOTS)), session, tmp_path)
     thread = threading.Thread(target=app.run, daemon=True)
     thread.start()

@@ -20,8 +20,8 @@ def replay(server, record, tmp_path, monkeypatch):
     path = tmp_path / "walk.npz"
     recording.save(path)
     replay = Replay(server, recording, path)
-    replay.told = []
-    monkeypatch.setattr(replay._notices, "tell", lambda text, *_: replay.told.append(text))
+    replay.notices = []
+    monkeypatch.setattr(replay._notices, "tell", lambda text, *_: replay.notices.append(text))
     return replay
 
 
@@ -50,7 +50,7 @@ def test_it_goes_on_with_the_clock_and_begins_again_at_its_end(replay):
     assert replay.advance(0.3) == 5
     replay._playing.value = False
     assert replay.advance(0.1) == 5
-    assert replay.told == []
+    assert replay.notices == []
 
 
 def test_what_is_drawn_is_the_step_that_was_sought(replay):
@@ -62,7 +62,7 @@ def test_what_is_drawn_is_the_step_that_was_sought(replay):
         hands = replay.scene.hands.batched_positions.reshape(2, 2, 3)
         drawn = [replay.scene.to_robot(hands[i, 1], i) for i in range(2)]
         np.testing.assert_allclose(drawn, samples[step]["hand_w"][:, 1], atol=1e-5)
-    assert replay.told == []
+    assert replay.notices == []
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -73,18 +73,18 @@ def test_a_time_or_speed_that_is_no_number_is_refused_and_what_was_is_shown(repl
     for handle, kept in ((replay._time, 0.2), (speed, 0.5)):
         send(handle, value)
         assert handle.value == kept
-    assert len(replay.told) == 2
-    assert all("must be a finite number" in text for text in replay.told)
+    assert len(replay.notices) == 2
+    assert all("must be a finite number" in text for text in replay.notices)
     assert replay.advance(0.2) == 15
 
 
-def test_a_time_or_speed_out_of_range_is_moved_to_its_end_and_told(replay):
+def test_a_time_or_speed_out_of_range_is_moved_to_its_end_and_a_notice_says_so(replay):
     speed = slider(replay, "speed")
     for handle, sent, used in ((replay._time, 1e9, 0.78), (speed, 1e9, 4.0), (replay._time, -1.0, 0.0)):
         send(handle, sent)
         assert handle.value == pytest.approx(used)
-    assert len(replay.told) == 3
-    assert all("is outside" in text for text in replay.told)
+    assert len(replay.notices) == 3
+    assert all("is outside" in text for text in replay.notices)
     assert replay.advance(0.05) == 10
 
 

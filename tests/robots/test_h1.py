@@ -1,8 +1,6 @@
-"""H1 against numbers typed from its published parameters, and against the laws of mirrors."""
+"""H1 against numbers typed from its published parameters."""
 
 from __future__ import annotations
-
-import dataclasses
 
 import mujoco
 import numpy as np
@@ -21,7 +19,7 @@ JOINTS = (
 
 def default_qpos(spec, model) -> np.ndarray:
     qpos = model.qpos0.copy()
-    qpos[:7] = [0, 0, spec.nominal_height_m, 1, 0, 0, 0]
+    qpos[:7] = [0, 0, spec.base_height_m, 1, 0, 0, 0]
     qpos[7:] = [j.default_rad for j in spec.joints]
     return qpos
 
@@ -107,42 +105,6 @@ def test_passive_joint_parameters(model):
     np.testing.assert_array_equal(model.dof_armature[6:], 0.1)
 
 
-def test_mirror_is_an_involution(spec):
-    by_name = {j.name: j for j in spec.joints}
-    for joint in spec.joints:
-        mirror = by_name[joint.mirror_name]
-        assert mirror.mirror_name == joint.name
-        assert mirror.mirror_sign == joint.mirror_sign
-        assert (mirror is joint) == (joint.name == "torso")
-
-
-def test_mirrored_angles_give_the_mirror_image(spec, model, rng):
-    import torch
-
-    index = {j.name: i for i, j in enumerate(spec.joints)}
-    q = (0.8 * torch.rand(19, generator=rng) - 0.4).double().numpy()
-    mirrored = np.array([j.mirror_sign * q[index[j.mirror_name]] for j in spec.joints])
-    poses = []
-    for angles in (q, mirrored):
-        data = mujoco.MjData(model)
-        data.qpos[:7] = [0, 0, 1, 1, 0, 0, 0]
-        data.qpos[7:] = angles
-        mujoco.mj_kinematics(model, data)
-        poses.append(data)
-    swap = {"left": "right", "right": "left"}
-    for body in spec.bodies:
-        side = body.name.split("_")[0]
-        other = body.name.replace(side, swap.get(side, side), 1)
-        # Published frames differ between left and right in the seventh digit.
-        np.testing.assert_allclose(
-            poses[1].body(other).xpos, poses[0].body(body.name).xpos * [1, -1, 1], atol=1e-6, err_msg=body.name
-        )
-    for arm in ("left", "right"):
-        np.testing.assert_allclose(
-            poses[1].site(f"{swap[arm]}_hand").xpos, poses[0].site(f"{arm}_hand").xpos * [1, -1, 1], atol=1e-6
-        )
-
-
 def test_default_pose_has_its_soles_on_the_floor(spec, model):
     data = mujoco.MjData(model)
     data.qpos[:] = default_qpos(spec, model)
@@ -152,22 +114,6 @@ def test_default_pose_has_its_soles_on_the_floor(spec, model):
         assert abs(data.site(foot).xpos[2]) < 2e-3
         np.testing.assert_allclose(data.site(foot).xmat.reshape(3, 3)[:, 2], [0, 0, 1], atol=1e-6)
     assert data.site("left_foot").xpos[1] > 0.1 > -0.1 > data.site("right_foot").xpos[1]
-
-
-def test_flexion_lifts_a_sole_straight_up_and_keeps_it_level(spec, model):
-    for foot in spec.feet:
-        soles = []
-        for share in (0.0, 1.0):
-            data = mujoco.MjData(model)
-            data.qpos[:] = default_qpos(spec, model)
-            for joint, angle in foot.flexion:
-                data.qpos[model.joint(joint).qposadr[0]] += share * angle
-            mujoco.mj_kinematics(model, data)
-            soles.append((data.site(f"{foot.side}_foot").xpos.copy(), data.site(f"{foot.side}_foot").xmat[8]))
-        (down, _), (up, level) = soles
-        np.testing.assert_allclose(up[:2], down[:2], atol=0.012)
-        assert 0.08 < up[2] - down[2] < 0.12
-        assert level > 0.999
 
 
 def test_default_pose_stands_on_its_weight(spec, model):
@@ -244,11 +190,3 @@ def test_unknown_names_are_refused_with_the_known_ones(spec):
         spec.chain("pelvis", "torso_link")
     with pytest.raises(ValueError, match="collision 'none' is unknown; known: feet, full"):
         build_model(spec, "none")
-
-
-def test_joints_must_be_ordered_lower_body_first(spec):
-    with pytest.raises(ValueError, match="lower body first"):
-        dataclasses.replace(spec, joints=spec.joints[::-1])
-    lone = dataclasses.replace(spec.joints[0], mirror_name="nobody")
-    with pytest.raises(ValueError, match="mirror of left_hip_yaw is unknown: 'nobody'"):
-        dataclasses.replace(spec, joints=(lone, *spec.joints[1:]))

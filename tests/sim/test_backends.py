@@ -7,8 +7,9 @@ import sys
 
 import pytest
 import torch
+from random_policy import save_random_policy
 
-from cotap.envs import H1Env, H1EnvConfig
+from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.evaluate import main as evaluate
 from cotap.sim import BatchSimulation, backends, make_simulation, resolve_backend
 from cotap.train import main as train
@@ -41,16 +42,17 @@ def test_a_backend_that_is_named_is_taken(machine, card):
     assert resolve_backend("mjbatch") == "mjbatch"
 
 
-def test_warp_that_is_not_installed_is_named(machine, capsys):
+def test_warp_that_is_not_installed_is_named(machine, capsys, tmp_path):
+    policy = str(save_random_policy(tmp_path / "policy.pt"))
     machine(True, False)
     with pytest.raises(ValueError, match=r"backend 'warp' needs mujoco_warp, .* pip install cotap\[warp\]"):
         resolve_backend("warp")
     with pytest.raises(ValueError, match=r"pip install cotap\[warp\]"):
-        H1Env(H1EnvConfig(num_envs=1, backend="warp"))
+        HumanoidEnv(HumanoidEnvConfig(num_envs=1, backend="warp"))
     for command, args in (
         (train, ["base", "--backend", "warp", "--num-envs", "2"]),
         (train, ["--backend", "warp"]),
-        (evaluate, ["impact", "--backend", "warp", "--num-envs", "2"]),
+        (evaluate, ["impact", "--checkpoint", policy, "--backend", "warp", "--num-envs", "2"]),
     ):
         assert command(args) == 2
         assert "pip install cotap[warp]" in capsys.readouterr().err

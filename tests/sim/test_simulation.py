@@ -1,4 +1,4 @@
-"""The batch against single MuJoCo worlds and hand-worked numbers."""
+"""The batch against single MuJoCo envs and hand-worked numbers."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from cotap.sim import BatchSimulation, DelayedTargets
+from cotap.sim import BatchSimulation
 
 N = 3
 FREE_BODY = """
@@ -35,7 +35,7 @@ def no_drive(sim):
     return lambda _: torch.zeros(sim.num_envs, sim.model.nu)
 
 
-def test_matches_single_worlds(sim, model, rng):
+def test_matches_single_envs(sim, model, rng):
     qpos, qvel = start(model, 1.0)
     qpos[:, 7:] = 0.1 * torch.randn(N, 19, generator=rng)
     qvel += 0.3 * torch.randn(N, model.nv, generator=rng)
@@ -62,7 +62,7 @@ def test_step_lasts_substeps_times_timestep(sim, model):
     torch.testing.assert_close(sim.qvel[:, 2], torch.full((N,), -9.81 * 0.02, dtype=torch.float64), rtol=2e-2, atol=0)
 
 
-def test_masked_reset_touches_only_its_worlds(sim, model):
+def test_masked_reset_touches_only_its_envs(sim, model):
     sim.reset(everyone(), *start(model, 1.0))
     sim.xfrc[:, 1, 0] = 10.0
     for _ in range(3):
@@ -84,7 +84,7 @@ def test_masked_reset_touches_only_its_worlds(sim, model):
     assert 3.8 < float(sim.sensor("left_foot_pos")[1, 2]) < 4.1
 
 
-def test_reset_of_no_world_changes_nothing(sim, model):
+def test_reset_of_no_env_changes_nothing(sim, model):
     sim.reset(everyone(), *start(model))
     before = sim.snapshot().state
     sim.reset(~everyone(), torch.zeros(0, model.nq), torch.zeros(0, model.nv))
@@ -96,7 +96,7 @@ def test_reset_refuses_a_mask_of_another_size(sim, model):
         sim.reset(torch.ones(4, dtype=torch.bool), *start(model))
 
 
-def test_masses_differ_in_effect_between_worlds():
+def test_masses_differ_in_effect_between_envs():
     model = mujoco.MjModel.from_xml_string(FREE_BODY)
     sim = BatchSimulation(model, 2, substeps=1, num_threads=1, fields=("body_mass", "body_inertia"))
     sim.field("body_mass")[1, 1] = 8.0
@@ -116,7 +116,7 @@ def test_update_constants_follows_masses(model):
     np.testing.assert_allclose(sim.field("body_subtreemass")[:, 1], [51.437, 102.874])
 
 
-def test_friction_differs_in_effect_between_worlds(spec, model):
+def test_friction_differs_in_effect_between_envs(spec, model):
     sim = BatchSimulation(model, 2, 2, 1, fields=("geom_friction",))
     sim.field("geom_friction")[0, :, 0] = 0.05
     sim.field("geom_friction")[1, :, 0] = 1.0
@@ -212,34 +212,3 @@ def test_restore_refuses_other_sizes_and_fields(sim, model):
 def test_sizes_must_be_positive(model, bad):
     with pytest.raises(ValueError, match=rf"{next(iter(bad))} must be a positive integer"):
         BatchSimulation(model, **{"num_envs": 1, "substeps": 1, **bad})
-
-
-@pytest.mark.parametrize(
-    ("delay_ms", "first", "second"),
-    [
-        (0.0, 5.0, 5.0),  # at once
-        (2.5, 4.0, 5.0),  # a quarter of the first physics step still has the old target: 1 + 0.75 * 4
-        (10.0, 1.0, 5.0),  # exactly one physics step late
-        (15.0, 1.0, 3.0),  # half of the second step
-        (20.0, 1.0, 1.0),  # a whole control step late
-    ],
-)
-def test_delay_mixes_old_and_new_by_their_share_of_the_step(delay_ms, first, second):
-    targets = DelayedTargets(2, 1, substeps=2, control_dt=0.02)
-    targets.reset(torch.tensor([True, True]), torch.tensor([[1.0], [1.0]]))
-    targets.delay_s[0] = delay_ms / 1e3
-    targets.send(torch.tensor([[5.0], [5.0]]))
-    torch.testing.assert_close(targets.at(0), torch.tensor([[first], [5.0]]))
-    torch.testing.assert_close(targets.at(1), torch.tensor([[second], [5.0]]))
-    # By the next control step the target has arrived everywhere.
-    targets.send(torch.tensor([[5.0], [5.0]]))
-    torch.testing.assert_close(targets.at(0), torch.tensor([[5.0], [5.0]]))
-
-
-def test_resetting_a_delay_forgets_what_was_sent():
-    targets = DelayedTargets(2, 1, substeps=2, control_dt=0.02)
-    targets.delay_s[:] = 0.02
-    targets.send(torch.tensor([[5.0], [5.0]]))
-    targets.reset(torch.tensor([False, True]), torch.tensor([[2.0]]))
-    torch.testing.assert_close(targets.at(0), torch.tensor([[0.0], [2.0]]))
-    torch.testing.assert_close(targets.current, torch.tensor([[5.0], [2.0]]))

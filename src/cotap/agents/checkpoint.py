@@ -22,12 +22,10 @@ VERSION = 1
 PARTS: dict[str, Any] = {
     "kind": str, "layout": dict, "agents": dict, "config": dict, "model": dict, "learner": dict, "env": dict,
     "iteration": int, "samples": int, "wall_seconds": (int, float), "rng": torch.Tensor, "device_rng": torch.Tensor,
-    "progress": dict,
 }  # fmt: skip
 """What a checkpoint of a run holds; the parts of a shipped one may be empty."""
-OPTIONAL_PARTS = {"device_rng", "progress"}
-"""What some checkpoints lack: random numbers of a graphics card, if networks were on none, and how far what fades or
-grows with success had come, if they are from before that was kept."""
+OPTIONAL_PARTS = {"device_rng"}
+"""What some checkpoints lack: random numbers of a GPU, if networks were on none."""
 MALFORMED = (RuntimeError, ValueError, TypeError, LookupError, AttributeError, OverflowError)
 """What code that takes over a state raises where the state is not what it should be."""
 

@@ -5,12 +5,11 @@ from __future__ import annotations
 import copy
 import hashlib
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import torch
 
 from cotap.agents.actors import DualActorCritic, Observations
-from cotap.agents.heads import Head, SymmetricHead
 from cotap.agents.losses import gaussian_kl
 from cotap.checks import require_one_of, require_range
 
@@ -25,15 +24,11 @@ class DistillationConfig:
     """Iterations in which the weight falls linearly to zero."""
     agents: tuple[str, ...] = ("lower",)
     """Agents that are guided."""
-    free_start: float = 0.3
-    """Factor on the actions of agents that are not guided, at the start: the base's arm actions are feedback for PD's
-    gains, and through stiffness of several times those they swing the arms."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
         require_range("distillation.beta", self.beta, 0.0, 1e3)
         require_range("distillation.end_iterations", self.end_iterations, 1, 10**9)
-        require_range("distillation.free_start", self.free_start, 0.0, 10.0)
         for name in self.agents:
             require_one_of("distillation.agents", name, ("lower", "upper"))
 
@@ -55,11 +50,8 @@ class Guide:
         self._fingerprint = self.fingerprint()
 
     def start(self, model: DualActorCritic) -> None:
-        """Give `model` the base's weights, and less of the actions of agents that nobody guides."""
+        """Give `model` the base's weights."""
         model.load_state_dict(self.model.state_dict())
-        for name, actor in model.actors.items():
-            if name not in self.cfg.agents:
-                cast(Head | SymmetricHead, actor).scale_output(self.cfg.free_start)
 
     def fingerprint(self) -> str:
         """SHA-256 of the frozen policy's bytes, tensor by tensor in the order of their names."""

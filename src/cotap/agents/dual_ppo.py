@@ -36,12 +36,8 @@ class DualPPOConfig:
     """Standard deviation of actions at the start."""
     std_half_life: float = 300.0
     """Iterations in which the largest standard deviation allowed falls by half: wide at first, precise later."""
-    least_std: float = 0.2
+    least_std: float = 0.25
     """Where that fall ends."""
-    restart_std: tuple[float, ...] = ()
-    """Standard deviations, agent by agent, with which trained networks go on whose optimisers are new; none for as they
-    were. A policy that has become precise learns slowly: its rate follows the KL divergence, which grows with the
-    inverse square of the deviation. At most `least_std`, or `initial_std` if that is larger."""
     steps: int = 24
     """Steps per world and iteration."""
     epochs: int = 3
@@ -56,7 +52,7 @@ class DualPPOConfig:
     """Clip range of the surrogate."""
     value_clip: float = 0.2
     """Values are learnt no further than this from what they were when the rollout began; 0 for any distance."""
-    entropy: float = 0.002
+    entropy: float = 0.003
     """Weight of the entropy bonus."""
     value: float = 1.0
     """Weight of the value loss."""
@@ -97,8 +93,6 @@ class DualPPOConfig:
             require_range(f"ppo.{name}", getattr(self, name), 1e-8, 1e6)
         for name in ("entropy", "value", "value_clip"):
             require_range(f"ppo.{name}", getattr(self, name), 0.0, 1e3)
-        for i, std in enumerate(self.restart_std):
-            require_range(f"ppo.restart_std[{i}]", std, 1e-8, max(self.initial_std, self.least_std))
 
 
 @dataclass
@@ -138,9 +132,6 @@ class DualPPO:
         self.guide, self.ranks = guide, ranks or Ranks()
         self.dtype = resolve_precision(cfg.precision, device)
         self.names = tuple(layout.action_slices)
-        stds = cfg.restart_std
-        if stds and len(stds) != len(self.names):
-            raise ValueError(f"ppo.restart_std must be one for each of {', '.join(self.names)}, got {stds}")
         self.model = DualActorCritic(layout, cfg.hidden, cfg.initial_std).to(device)
         self.learning_rates = dict.fromkeys(self.names, cfg.learning_rate)
         self.optimizers = {
@@ -316,17 +307,8 @@ class DualPPO:
 
     def begin_anew(self) -> None:
         """Start with networks that are trained and optimisers that are not: from the lowest rate, since Adam's first
-        steps are as large as its rate, whatever the gradient (rates grow by themselves where a policy hardly moves),
-        and with `restart_std`. Raises ValueError if that is not for as many agents as there are."""
+        steps are as large as its rate, whatever the gradient. Rates grow by themselves where a policy hardly moves."""
         self.learning_rates = dict.fromkeys(self.names, LOWEST_RATE)
-        stds = self.cfg.restart_std
-        if stds and len(stds) != len(self.names):
-            raise ValueError(
-                f"ppo.restart_std must be one for each of {', '.join(self.names)}, got {len(stds)}: {stds}"
-            )
-        with torch.no_grad():
-            for name, std in zip(self.names, stds, strict=False):
-                self.model.log_std[name].fill_(math.log(std))
 
     def state_dict(self) -> dict[str, Any]:
         """Optimisers, learning rates and number of updates; the networks are saved apart."""

@@ -23,13 +23,6 @@ class Head(nn.Module):
         nn.init.orthogonal_(last.weight, gain=output_gain)
         nn.init.zeros_(last.bias)
 
-    @torch.no_grad()
-    def scale_output(self, factor: float) -> None:
-        """Multiply what comes out by `factor` from now on."""
-        last = cast(nn.Linear, self.mlp[-1])
-        last.weight.mul_(factor)
-        last.bias.mul_(factor)
-
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """(N, inputs) to (N, outputs), float32."""
         for layer in list(self.mlp)[:-1]:
@@ -77,12 +70,6 @@ class SymmetricHead(nn.Module):
         self.output_weight = nn.Parameter(torch.empty(outputs.index.numel(), hidden[-1] // 2))
         nn.init.orthogonal_(self.output_weight, gain=output_gain)
         self.output_bias = nn.Parameter(torch.zeros(outputs.index.numel()))
-
-    @torch.no_grad()
-    def scale_output(self, factor: float) -> None:
-        """Multiply what comes out by `factor` from now on."""
-        self.output_weight.mul_(factor)
-        self.output_bias.mul_(factor)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """(N, inputs) to (N, outputs), float32."""

@@ -28,7 +28,8 @@ def columns(layout: dict[str, Any]) -> Columns:
         for i in range(width)
     ]
     privileged = [(name, i) for name, width, _ in layout["critic_terms"] for i in range(width)]
-    return {"policy": seen, "clean": seen, "privileged": privileged}
+    present = [(name, i) for name, width, _ in layout["terms"] for i in range(width)]
+    return {"policy": seen, "clean": seen, "present": present, "privileged": privileged}
 
 
 def take_over(path: str, content: dict[str, Any], model: DualActorCritic, env: Any, other_terms: bool = False) -> bool:

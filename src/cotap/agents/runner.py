@@ -102,8 +102,7 @@ class TrainingFault(RuntimeError):
 
 class DualRunner(OnPolicyRunner):
     """rsl_rl's runner for two agents. Replaces its loop, its saving (all that a run depends on) and its loading
-    (no code is run from a file); needs an environment with `action_slices`, `obs_groups`, `state_dict` and `progress`,
-    and among several ranks with `keep_in_step`.
+    (no code is run from a file); needs an environment with `action_slices`, `obs_groups` and `state_dict`.
 
     Args:
         env: The environment.
@@ -135,7 +134,7 @@ class DualRunner(OnPolicyRunner):
     def learn(self, num_learning_iterations: int | None = None, init_at_random_ep_len: bool = False) -> None:
         """Train up to `runner.iterations` in all (or for so many more), saving at intervals and at the end.
 
-        A save that fails (a full disk) is reported and tried again after every iteration; worlds that diverge and
+        A save that fails (a full disk) is reported and tried again after every iteration; envs that diverge and
         steps that are skipped are reported as they are counted.
 
         Raises:
@@ -159,8 +158,8 @@ class DualRunner(OnPolicyRunner):
             run_log = RunLog(self.run_dir, env.samples)  # pyright: ignore[reportAttributeAccessIssue]
             precision = str(alg.dtype).removeprefix("torch.")
             processes = f"{ranks.size} x " if ranks.size > 1 else ""
-            worlds = f"{processes}{env.num_envs} worlds on {env.device}"
-            say(f"{worlds}, networks {alg.cfg.hidden} in {precision} on {self.device}, {self.run_dir}")
+            envs = f"{processes}{env.num_envs} envs on {env.device}"
+            say(f"{envs}, networks {alg.cfg.hidden} in {precision} on {self.device}, {self.run_dir}")
         obs = self._observations()
         self._saved = -1
         bar = tqdm(
@@ -174,7 +173,7 @@ class DualRunner(OnPolicyRunner):
                     stopping = ranks.any(self._stop)
                     self.current_learning_iteration = it + 1
                     if ranks.size > 1:
-                        self._kept = copy.deepcopy(self._content(self._progress(), worlds=False))
+                        self._kept = copy.deepcopy(self._content(envs=False))
                     if run_log:
                         self._log(run_log, scalars)
                     if (it + 1) % self.runner_cfg.save_interval == 0 or self._save_failed:
@@ -224,15 +223,13 @@ class DualRunner(OnPolicyRunner):
             "throughput/learn_s": end - collected,
         }
         self._report(getattr(env, "num_diverged", 0) - diverged, learned)
-        if self.ranks.size > 1:
-            env.keep_in_step(self.ranks.mean)  # pyright: ignore[reportAttributeAccessIssue]
         return obs, self.ranks.mean_of(scalars)
 
     def _report(self, diverged: int, learned: dict[str, float]) -> None:
         """Name in the log what went wrong in an iteration and was contained."""
         where = f"iteration {self.current_learning_iteration + 1}"
         if diverged:
-            say(f"{where}: worlds diverged {diverged} times; each was ended, counted and started again")
+            say(f"{where}: envs diverged {diverged} times; each was ended, counted and started again")
         for name in self.alg.names:
             if skipped := learned[f"{name}/skipped"]:
                 say(f"{where}: {skipped:.0f} steps of agent {name!r} skipped, their gradient was not finite")
@@ -270,26 +267,21 @@ class DualRunner(OnPolicyRunner):
         if self.alg.guide:
             self.alg.guide.verify()
         target = Path(path) if path else self.run_dir / f"checkpoint_{self.current_learning_iteration:06d}.pt"
-        others, progress = self.ranks.gather(self._own_state), self._progress()
+        others = self.ranks.gather(self._own_state)
         if self.ranks.leads:
-            save_checkpoint(target, self._content(progress) | {"others": others, "infos": infos or {}})
+            save_checkpoint(target, self._content() | {"others": others, "infos": infos or {}})
             older = [path for path in self.run_dir.glob(CHECKPOINT_PATTERN) if path < target]
             if older:
                 _shed_simulator_states(max(older))
         self._saved = self.current_learning_iteration
 
-    def load(
-        self, path: str, *_: Any, map_location: str | None = None, other_terms: bool = False, **__: Any
-    ) -> dict:  # fmt: skip
-        """Load a checkpoint. What it lacks (a shipped one has no optimiser or simulator states) starts afresh; worlds
-        that do, among them those of another number of worlds or ranks or of other collisions, begin where its
-        curricula had come to.
+    def load(self, path: str, *_: Any, map_location: str | None = None, **__: Any) -> dict:
+        """Load a checkpoint. What it lacks starts afresh: a shipped one has no optimisers and no simulator states, and
+        those of another number of envs or ranks, or of other collisions, do not fit.
 
         Args:
             path: The file.
             map_location: Where to load it to; by default where the networks live.
-            other_terms: Whether it may have been trained with other terms in its observation. Its networks are then
-                refitted to these, and optimisers and worlds start afresh.
 
         Raises:
             CheckpointError: the file cannot be used, or was trained for another robot or observation layout.
@@ -297,9 +289,7 @@ class DualRunner(OnPolicyRunner):
         content = load_checkpoint(path, map_location or self.device)
         require_parts(path, content, PARTS.keys() - {"agents", "kind"})
         env: Any = self.env
-        refitted = take_over(path, content, self.alg.model, env, other_terms)
-        if refitted or content.get("kind", self._kind) != self._kind:  # another stage's optimisers, laws and worlds
-            content.update(learner={}, env={}, others=[])
+        take_over(path, content, self.alg.model, env)
         fresh: list[str] = []
         try:
             if content["learner"]:
@@ -317,10 +307,6 @@ class DualRunner(OnPolicyRunner):
             else:
                 env.samples = content["samples"]
                 fresh.append("simulator states")
-                if "progress" in content:
-                    env.load_progress(content["progress"])
-                else:
-                    fresh.append("curricula")
         except MALFORMED as error:
             raise CheckpointError(f"checkpoint {path!r} has states that do not fit this run: {error}") from error
         if fresh:
@@ -328,22 +314,22 @@ class DualRunner(OnPolicyRunner):
         return content.get("infos", {})
 
     def _share_of(self, content: dict[str, Any]) -> dict[str, Any]:
-        """This rank's worlds and random numbers in a checkpoint; none, if it is of another number of ranks."""
+        """This rank's envs and random numbers in a checkpoint; none, if it is of another number of ranks."""
         states = [content, *content.get("others", [])]
         same_number = len(states) == self.ranks.size
         return states[self.ranks.rank] if same_number else {"env": {}}
 
-    def _are_ours(self, worlds: dict[str, Any], config: dict[str, Any]) -> bool:
-        """Whether these worlds of a run with that config are as many as ours, and of the same model."""
-        if not worlds or worlds["episode_length"].shape[0] != self.env.num_envs:
+    def _are_ours(self, envs: dict[str, Any], config: dict[str, Any]) -> bool:
+        """Whether these envs of a run with that config are as many as ours, and of the same model."""
+        if not envs or envs["episode_length"].shape[0] != self.env.num_envs:
             return False
         theirs, own = (c.get("training", {}).get("env", {}) for c in (config, self.config))
         return all(theirs.get(name) == own.get(name) for name in MODEL)
 
-    def _own_state(self, worlds: bool = True) -> dict[str, Any]:
+    def _own_state(self, envs: bool = True) -> dict[str, Any]:
         """What is this rank's own."""
         env: Any = self.env
-        saved = env.state_dict() if worlds and self.runner_cfg.save_worlds else {}
+        saved = env.state_dict() if envs and self.runner_cfg.save_envs else {}
         # Exploration and mini-batches are drawn where the networks are.
         drawn = {"device_rng": torch.cuda.get_rng_state(self.device)} if self._on_card else {}
         return {"env": saved, "rng": torch.get_rng_state(), **drawn}
@@ -364,11 +350,7 @@ class DualRunner(OnPolicyRunner):
     def _on_card(self) -> bool:
         return torch.device(self.device).type == "cuda"
 
-    def _progress(self) -> dict[str, float]:
-        """How far what fades or grows with success has come, over all ranks."""
-        return self.ranks.mean_of(self.env.progress())  # pyright: ignore[reportAttributeAccessIssue]
-
-    def _content(self, progress: dict[str, float], worlds: bool = True) -> dict[str, Any]:
+    def _content(self, envs: bool = True) -> dict[str, Any]:
         env: Any = self.env
         return {
             "kind": self._kind,
@@ -377,11 +359,10 @@ class DualRunner(OnPolicyRunner):
             "config": self.config,
             "model": self.alg.model.state_dict(),
             "learner": self.alg.state_dict(),
-            **self._own_state(worlds),
+            **self._own_state(envs),
             "iteration": self.current_learning_iteration,
             "samples": env.samples,
             "wall_seconds": self.wall_seconds,
-            "progress": progress,
         }
 
     def _observations(self) -> dict[str, torch.Tensor]:

@@ -15,8 +15,8 @@ class RunnerConfig:
     """Iterations in all, those of a resumed run included."""
     save_interval: int = 25
     """Iterations between checkpoints."""
-    save_worlds: bool = True
-    """Save every world's state (14 kB), so that a run goes on exactly; without, worlds start afresh."""
+    save_envs: bool = True
+    """Save every env's state (14 kB), so that a run goes on exactly; without, envs start afresh."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""

@@ -23,8 +23,8 @@ class LinkInertias:
     """(A, n, 3) centre of mass in the link's frame [m]."""
     inertia: torch.Tensor
     """(A, n, 3, 3) about the centre of mass, in the link's frame [kg m^2]."""
-    armature: float = 0.0
-    """Rotor inertia added to every joint [kg m^2]."""
+    armature: torch.Tensor
+    """(A, n) rotor inertia added to every joint [kg m^2]."""
 
 
 def gravity_torque(links: LinkInertias, pose: ChainPose, up: torch.Tensor) -> torch.Tensor:
@@ -68,7 +68,7 @@ def joint_inertia(links: LinkInertias, pose: ChainPose) -> torch.Tensor:
     for i in range(joints):
         shared = (axes[:, i : i + 1] * angular[:, i:] + origin_velocity[:, i : i + 1] * linear[:, i:]).sum(2)
         inertia[:, i, i:] = inertia[:, i:, i] = shared
-    inertia.diagonal(dim1=1, dim2=2).add_(links.armature)
+    inertia.diagonal(dim1=1, dim2=2).add_(links.armature.unsqueeze(1))
     return inertia.movedim(-1, 0)
 
 

@@ -43,15 +43,15 @@ class Arms:
     """(A, n) upper joint limits [rad]."""
     speed: torch.Tensor
     """(A, n) joint velocity limits [rad/s]."""
-    friction: float = 0.0
-    """Viscous friction of every joint, beside what a law adds [Nms/rad]."""
+    friction: torch.Tensor
+    """(A, n) viscous friction of the joints, beside what a law adds [Nms/rad]."""
 
     def to(self, dtype: torch.dtype) -> Arms:
         """The same arms in another precision."""
         i = self.inertias
-        links = LinkInertias(i.mass.to(dtype), i.com.to(dtype), i.inertia.to(dtype), i.armature)
-        kp, kd, low, high, speed = (x.to(dtype) for x in (self.kp, self.kd, self.low, self.high, self.speed))
-        return Arms(self.chains.to(dtype), links, kp, kd, low, high, speed, self.friction)
+        links = LinkInertias(*(x.to(dtype) for x in (i.mass, i.com, i.inertia, i.armature)))
+        own = (self.kp, self.kd, self.low, self.high, self.speed, self.friction)
+        return Arms(self.chains.to(dtype), links, *(x.to(dtype) for x in own))
 
 
 @dataclass(frozen=True)

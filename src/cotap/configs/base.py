@@ -1,8 +1,10 @@
-"""Recipes of stage 1: PD control on all joints; legs follow commands, arms a reference."""
+"""Recipes of stage 1: PD control on all joints; legs follow commands, arms a reference.
+
+A recipe declares all that differs from the defaults. What ships is `default`, from nothing, in one run.
+"""
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -11,8 +13,16 @@ import torch
 from cotap.agents.dual_ppo import DualPPOConfig
 from cotap.agents.runner_config import RunnerConfig
 from cotap.checks import reason_of, require_range
-from cotap.envs import H1EnvConfig
-from cotap.envs.commands import STEADY_RAD
+from cotap.envs.actions import ActionConfig
+from cotap.envs.commands import CommandConfig
+from cotap.envs.config import HumanoidEnvConfig, RewardConfig
+from cotap.envs.curriculum import AssistConfig, RampConfig
+from cotap.envs.external_forces import ExternalForceConfig
+from cotap.envs.gait_phase import GaitConfig
+from cotap.envs.hand_loads import HandLoadConfig
+from cotap.envs.observations import ObservationConfig
+from cotap.envs.pushes import PushConfig
+from cotap.envs.rewards import UpperRewards
 
 
 @dataclass
@@ -22,10 +32,10 @@ class BaseTraining:
     seed: int = 0
     """Seed of networks, exploration and environment."""
     threads: int = 0
-    """Processor threads of torch and physics; 0 takes every processor. A run is reproducible for one number."""
+    """CPU threads of torch and physics; 0 takes every core. A run is reproducible for one number."""
     device: str = "cpu"
     """Where the networks live; physics is where `env.backend` has it."""
-    env: H1EnvConfig = field(default_factory=H1EnvConfig)
+    env: HumanoidEnvConfig = field(default_factory=HumanoidEnvConfig)
     ppo: DualPPOConfig = field(default_factory=DualPPOConfig)
     runner: RunnerConfig = field(default_factory=RunnerConfig)
 
@@ -42,96 +52,77 @@ class BaseTraining:
 
 
 def default() -> BaseTraining:
-    """From nothing to a policy that walks."""
-    training = BaseTraining()
-    training.env.assist.enabled = True
-    training.env.num_envs = 1024
-    training.env.commands.foresee_falls = True
-    training.env.commands.step_roll_damping_s = 0.02
-    # Loads on its hands slow down learning to walk; `robust` brings them.
-    training.env.hand_forces.enabled = False
-    training.runner.iterations = 1225
-    return training
+    """What ships: walks, stands, bears loads on the hands, and takes pushes; 300 M samples."""
+    return BaseTraining(
+        env=HumanoidEnvConfig(
+            assist=AssistConfig(enabled=True),
+            forces=ExternalForceConfig(
+                hand_loads=HandLoadConfig(enabled=True, ramp=RampConfig(20e6, 60e6, first=0.1)),
+                pushes=PushConfig(enabled=True, velocity=(0.0, 1.3), ramp=RampConfig(30e6, 80e6)),
+            ),
+        ),
+        runner=RunnerConfig(iterations=6103),
+    )
+
+
+def quick() -> BaseTraining:
+    """Walking in the shortest time: no pushes, no loads; 30 M samples."""
+    return BaseTraining(
+        env=HumanoidEnvConfig(assist=AssistConfig(enabled=True, end_samples=20e6)),
+        ppo=DualPPOConfig(std_half_life=200.0, least_std=0.2),
+        runner=RunnerConfig(iterations=610),
+    )
 
 
 def paper() -> BaseTraining:
-    """The paper's networks, otherwise the default."""
-    training = default()
-    training.ppo.hidden = (512, 256, 128)
-    return training
+    """The paper's value for every setting that it names, and FALCON's for what it takes from there.
 
-
-def walk(training: BaseTraining | None = None) -> BaseTraining:
-    """What a policy that walks learns next, on top of its own config or else of the default: to walk and stand well,
-    arms moving, with legs that may not pass through each other."""
-    training = copy.deepcopy(training) if training else default()
-    env = training.env
-    let_legs_collide(env)
-    env.commands.steady_rad = STEADY_RAD
-    env.commands.foresee_falls = True
-    calm_the_arms(env)
-    env.commands.stand_probability = 0.3
-    env.rewards.lower.track_mean_velocity = 6.0
-    env.rewards.lower.track_mean_yaw_rate = 2.4
-    env.rewards.upper.steady_torso = 3.0
-    training.ppo.least_std = 0.12
-    training.ppo.desired_kl = 0.01
-    training.runner.iterations = 2085
-    return training
-
-
-def robust(training: BaseTraining | None = None) -> BaseTraining:
-    """What a policy that walks learns next, on top of its own config or else of the default: to take blows and loads
-    on its hands, and to step where standing does not do any more."""
-    training = walk(training)
-    env = training.env
-    env.commands.step_timing = True
-    env.blows.enabled = True
-    env.hand_forces.enabled = True
-    env.hand_forces.episode_share = 0.6
-    env.hand_forces.curriculum_start = 0.2
-    env.hand_forces.curriculum_back = 0.1
-    return training
-
-
-def let_legs_collide(env: H1EnvConfig) -> None:
-    """All shapes meet, and feet keep apart: legs that may pass through each other learn to, and trip anywhere else."""
-    env.collision = "full"
-    commands = env.commands
-    commands.step_apart_m, commands.step_clear_m = max(commands.step_apart_m, 0.08), max(commands.step_clear_m, 0.25)
-
-
-def calm_the_arms(env: H1EnvConfig) -> None:
-    """Arms that move throw the torso around. Targets that do not run ahead of their reference do it less, the waist
-    takes some of it, and rewards are steep where a policy that walks already is."""
-    env.actions.reference_lead_s = 0.0
-    env.commands.waist_damping_s = 0.08
-    env.rewards.lower.track_yaw_rate_closely = 5.0
-    env.rewards.lower.foot_slip = -5.0
+    Kept from `default` is what neither names: physics step, wrench of the first steps, most reward weights.
+    """
+    return BaseTraining(
+        env=HumanoidEnvConfig(
+            num_envs=4096,
+            actions=ActionConfig(upper_scale=0.25, upper_mode="absolute"),
+            observations=ObservationConfig(critic="history"),
+            commands=CommandConfig(
+                velocity_x=(-1.0, 1.0), velocity_y=(-1.0, 1.0), yaw_rate=(-1.0, 1.0), stand_probability=0.4,
+                axis_zero_probability=0.0, resample_s=(10.0, 10.0),
+            ),
+            gait=GaitConfig(period_s=1.0),
+            assist=AssistConfig(enabled=True),
+            forces=ExternalForceConfig(
+                hand_loads=HandLoadConfig(
+                    enabled=True, episode_share=1.0, torque_share=1.0, ramp=RampConfig(20e6, 100e6, first=0.1)
+                )
+            ),
+        ),
+        ppo=DualPPOConfig(
+            hidden=(512, 256, 128), initial_std=0.8, std_half_life=1e6, entropy=0.01, epochs=5, learning_rate=1e-4,
+            desired_kl=0.01, symmetric=False,
+        ),
+        runner=RunnerConfig(iterations=20_000),
+    )  # fmt: skip
 
 
 def facet() -> BaseTraining:
     """FACET as the paper trains it: PD arms, its tracking reward on the data's own motion, no moving reference."""
     training = default()
-    training.env.hand_forces.enabled = True
-    reward_as_facet(training.env)
+    training.env.rewards = RewardConfig(upper=facet_rewards())
     return training
 
 
-def reward_as_facet(env: H1EnvConfig) -> None:
-    """FACET's tracking reward of the hands takes the place of that of key points, at their weight."""
-    upper = env.rewards.upper
-    upper.track_hands_as_facet += upper.track_key_points + upper.track_key_velocities
-    upper.track_key_points = upper.track_key_velocities = 0.0
+def facet_rewards() -> UpperRewards:
+    """FACET's tracking reward of the hands in place of that of key points, at their weight."""
+    weights = UpperRewards()
+    weights.track_hands_as_facet = weights.track_key_points + weights.track_key_velocities
+    weights.track_key_points = weights.track_key_velocities = 0.0
+    return weights
 
 
 BASE_RECIPES: dict[str, Callable[[], BaseTraining]] = {
     "default": default,
+    "quick": quick,
     "paper": paper,
-    "walk": walk,
-    "robust": robust,
     "facet": facet,
 }
 """Stage 1, by name."""
-CONTINUATIONS: dict[str, Callable[[BaseTraining], BaseTraining]] = {"walk": walk, "robust": robust}
-"""Recipes that may also go on from a checkpoint, and then change its config."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -14,17 +14,18 @@ from cotap.compliance.laws import SENSING_FORCE
 from cotap.configs import from_plain
 from cotap.deployment.joint_law import JointLaw, pd_law
 from cotap.deployment.metadata import PolicyError, PolicyMetadata
-from cotap.deployment.policy import OnnxPolicy, arm_advance
-from cotap.envs.commands import CommandConfig, CommandSource, leaning
-from cotap.envs.foresight import Foresight
-from cotap.envs.load_sense import LoadSense
-from cotap.envs.observations import ObservationHistory, actor_terms, actor_values
-from cotap.envs.reference import ReferenceMotion
+from cotap.deployment.policy import OnnxPolicy
+from cotap.envs.commands import CommandConfig, CommandSource
+from cotap.envs.gait_phase import GaitConfig
+from cotap.envs.observations import ObservationHistory, Term, actor_terms, actor_values
 from cotap.envs.state import RobotState
-from cotap.envs.step_timing import StepTiming
+from cotap.envs.terminations import TerminationConfig
 from cotap.envs.upper_body import UpperBody, UpperBodyConfig
+from cotap.motions.reference import ReferenceMotion
 from cotap.robots import ROBOTS, RobotSpec
 from cotap.robots.chains import arm_chains
+
+Config = TypeVar("Config", CommandConfig, GaitConfig, TerminationConfig, UpperBodyConfig)
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ class Readings:
     """What a robot's own sensors say, and what of the state follows from that."""
 
     state: RobotState
-    """One world, float64; what no joint encoder or IMU measures is NaN."""
+    """One env, float64; what no joint encoder or IMU measures is NaN."""
     torque: np.ndarray
     """(J,) joint torques, as the motors report them [Nm]."""
 
@@ -46,17 +47,13 @@ def robot_of(metadata: PolicyMetadata) -> RobotSpec:
     if metadata.robot not in ROBOTS:
         raise PolicyError(f"the policy is for the robot {metadata.robot!r}; known: {', '.join(ROBOTS)}")
     spec = ROBOTS[metadata.robot]()
-    terms, lower = actor_terms(len(spec.joints), len(spec.upper_joints)), len(spec.lower_joints)
     own = {
         "joints": list(spec.joint_names),
         "default_pose_rad": [j.default_rad for j in spec.joints],
         "kp": [j.kp for j in spec.joints],
         "kd": [j.kd for j in spec.joints],
-        "joint_range_rad": [list(j.range_rad) for j in spec.joints],
-        "velocity_limit_rad_s": [j.velocity_limit_rad_s for j in spec.joints],
         "nominal_height_m": spec.nominal_height_m,
-        "agents": {"lower": [0, lower], "upper": [lower, len(spec.joints)]},
-        "observation terms": [list(t) for t in terms],
+        "observation terms": [list(t) for t in observed_terms(metadata, spec)],
     }
     for name, value in own.items():
         found = metadata.observation["terms"] if name == "observation terms" else getattr(metadata, name)
@@ -72,32 +69,47 @@ def robot_of(metadata: PolicyMetadata) -> RobotSpec:
     return spec
 
 
+def observed_terms(metadata: PolicyMetadata, spec: RobotSpec) -> tuple[Term, ...]:
+    """What is observed of `spec`, with the arms' torque if the policy sees it."""
+    sees_torque = "arm_torque" in (name for name, _, _ in metadata.observation["terms"])
+    return actor_terms(len(spec.joints), len(spec.upper_joints), sees_torque)
+
+
 def command_config(metadata: PolicyMetadata) -> CommandConfig:
-    """The gait's period and the rates that commands change at. Raises PolicyError if they cannot be read."""
-    try:
-        cfg = from_plain(CommandConfig, metadata.commands)
-        cfg.check()
-    except (ValueError, TypeError) as error:
-        raise PolicyError(f"the policy's metadata commands cannot be used: {error}") from error
-    return cfg
+    """Ranges of commands and the rates that they change at. Raises PolicyError if they cannot be read."""
+    return _config(CommandConfig, "commands", metadata.commands)
+
+
+def gait_config(metadata: PolicyMetadata) -> GaitConfig:
+    """The stride. Raises PolicyError if it cannot be read."""
+    return _config(GaitConfig, "gait", metadata.gait)
+
+
+def termination_config(metadata: PolicyMetadata) -> TerminationConfig:
+    """What is a fall. Raises PolicyError if it cannot be read."""
+    return _config(TerminationConfig, "terminations", metadata.terminations)
 
 
 def law_config(metadata: PolicyMetadata) -> UpperBodyConfig:
-    """The laws that the arms were trained under. Raises PolicyError if they cannot be read."""
+    """The laws that the arms were trained under, with fixed parameters. Raises PolicyError if they cannot be read."""
+    laws = _config(UpperBodyConfig, "law", metadata.law)
+    laws.sampling.enabled = False
+    return laws
+
+
+def _config(cls: type[Config], entry: str, plain: dict[str, Any]) -> Config:
     try:
-        # Files of earlier versions have neither of the last two.
-        known = ("left", "right", "torso", "singularity_ratio")
-        cfg = from_plain(UpperBodyConfig, {name: metadata.law[name] for name in known if name in metadata.law})
+        cfg = from_plain(cls, plain)
         cfg.check()
     except (ValueError, TypeError) as error:
-        raise PolicyError(f"the policy's metadata law cannot be used: {error}") from error
+        raise PolicyError(f"the policy's metadata {entry} cannot be used: {error}") from error
     return cfg
 
 
 class Controller:
-    """The policy's loop: commands and gait clock, arm reference, observation history, targets, the arms' law.
+    """The policy's loop: observation history, gait phase, and the arms' law.
 
-    All but the networks (onnxruntime) is the environment's own code with one world, laws in float64.
+    All but the networks (onnxruntime) is the environment's own code with one env, laws in float64.
 
     Args:
         policy: The policy.
@@ -117,22 +129,21 @@ class Controller:
         for arm in spec.arms:
             if (name := laws.of(arm.side).name) in SENSING_FORCE:
                 raise ValueError(f"law {name!r} of the {arm.side} arm needs a hand's force, which is not measured")
-        self._policy, self.dt = policy, policy.metadata.control_dt
+        self._policy, self.metadata, self.dt = policy, policy.metadata, policy.metadata.control_dt
         self._rng = torch.Generator().manual_seed(seed)
         self._everyone = torch.ones(1, dtype=torch.bool)
-        self.commands = CommandSource(commands, 1, spec.nominal_height_m, self.dt)
-        self._foresight = Foresight(spec) if commands.foresee_falls else None
-        self._load_sense = LoadSense(spec, 1, self.dt, commands.brace_tilt_rad) if commands.lean_into_loads else None
-        self._timing = StepTiming(spec, 1, self.dt, commands.step_correct_s) if commands.step_timing else None
+        self.commands = CommandSource(commands, gait_config(policy.metadata), 1, spec.nominal_height_m, self.dt)
         self.motion = motion
         self.upper_body = UpperBody(laws, spec, 1, self.dt, torch.float64)
-        terms = actor_terms(len(spec.joints), len(spec.upper_joints))
+        terms = observed_terms(policy.metadata, spec)
         self._history = ObservationHistory(terms, 1, policy.metadata.observation["history"])
         self._default = torch.tensor([[j.default_rad for j in spec.joints]], dtype=torch.float64)
         self._kp, self._kd = np.array([j.kp for j in spec.joints]), np.array([j.kd for j in spec.joints])
         self._num_lower = len(spec.lower_joints)
         self._chains, self._shape = arm_chains(spec, torch.float64), (len(spec.arms), len(spec.arms[0].joints))
         self._action = np.zeros(len(spec.joints))
+        self.targets = np.array([j.default_rad for j in spec.joints])
+        """(J,) where joints were sent last [rad]."""
         self._started = False
 
     def restart(self) -> None:
@@ -140,10 +151,6 @@ class Controller:
         self._started, self._action = False, np.zeros_like(self._action)
         self.upper_body.reset(self._everyone, self._rng)
         self.commands.reset(self._everyone, self._rng)
-        if self._timing:
-            self._timing.reset(self._everyone)
-        if self._load_sense:
-            self._load_sense.reset(self._everyone)
         self.motion.reset(self._everyone, self._rng)
 
     @property
@@ -157,37 +164,29 @@ class Controller:
 
     def step(self, readings: Readings) -> JointLaw:
         """The law for the next control step. The first call fills the observation's history."""
-        s = readings.state
         if self._started:
-            turning = s.torso_angular_velocity_t
-            if self._load_sense:
-                torque = torch.from_numpy(readings.torque).unsqueeze(0)
-                self._load_sense.step(s, self.commands.current(), torque)
-                s = self._load_sense.felt(s)
-            lean, command = leaning(s.projected_gravity_t, turning), self.commands.current()
-            if self._foresight:
-                lean = self._foresight.lean(lean, s, command)
-            catch = self._timing.step(s, command, lean > self.commands.cfg.steady_rad) if self._timing else None
-            braces = self._load_sense.braces if self._load_sense else None
-            self.commands.step(self._rng, lean.float(), turning[:, 2].float(), catch, braces)
-            self.upper_body.step(self.dt, self._rng)
+            self.commands.step(self._rng)
         observed = self.motion.current().position
         values = actor_values(
-            s, self.commands.current(), observed, self._default, torch.from_numpy(self._action).unsqueeze(0),
-            torch.from_numpy(readings.torque[self._num_lower :]).unsqueeze(0),
+            readings.state, self.commands.current(), observed, self._default, torch.from_numpy(self._action)[None],
+            torch.from_numpy(readings.torque[self._num_lower :])[None],
         )  # fmt: skip
         present = self._history.scaled(values).float()
         fresh = torch.full((1,), not self._started)
-        targets, self._action = self._policy(self._history.append(present, fresh)[0].numpy())
         self._started = True
+        targets = self._policy(self._history.append(present, fresh)[0].numpy())
+        seen = observed[0].double().numpy()
+        self._action = self._policy.action(targets, seen)
         self.motion.step(self._rng)
         reference = self.motion.current()
-        advance = (x[0].double().numpy() for x in (observed, reference.position, reference.velocity))
-        targets[self._num_lower :] += arm_advance(self._policy.metadata, *advance)
+        # The arms are sent where the reference will be at the step's end, not where it was observed.
+        targets += self._policy.offset(reference.position[0].double().numpy()) - self._policy.offset(seen)
+        self.targets = targets
         law = pd_law(self._kp, self._kd, targets)
         if not self.upper_body.active:
             return law
-        self.upper_body.send(s, torch.from_numpy(targets[self._num_lower :]).unsqueeze(0), reference.velocity.double())
+        arms = torch.from_numpy(targets[self._num_lower :])[None]
+        self.upper_body.send(readings.state, arms, reference.velocity.double())
         return law.with_arms(self.upper_body.newest, self._num_lower)
 
 

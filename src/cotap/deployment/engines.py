@@ -61,7 +61,7 @@ class Engine(Protocol):
         ...
 
     def hold(self, held: bool) -> None:
-        """Hold the base in the world where it is now, or let it go."""
+        """Hold the base where it is now, or let it go."""
         ...
 
     def advance(self, law: JointLaw, steps: int, hand_force_w: np.ndarray) -> None:

@@ -1,13 +1,11 @@
-"""From a checkpoint to one ONNX file: both actors, observation normalisation, and all that is fed forward."""
+"""From a checkpoint to one ONNX file: observation in, joint targets out."""
 
 from __future__ import annotations
 
 import logging
-import math
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -19,16 +17,14 @@ from cotap import __version__
 from cotap.agents.actors import DualActorCritic
 from cotap.agents.checkpoint import require_layout, sha256
 from cotap.configs import to_plain
-from cotap.deployment.metadata import ACTION, FORMAT, INPUT, TARGETS, PolicyMetadata
+from cotap.deployment.metadata import FORMAT, INPUT, TARGETS, PolicyMetadata
 from cotap.deployment.policy import OnnxPolicy
-from cotap.envs import H1EnvConfig
+from cotap.envs import HumanoidEnvConfig
 from cotap.envs.actions import JointTargets
-from cotap.envs.commands import Command
-from cotap.envs.observations import ObservationHistory, actor_terms
+from cotap.envs.observations import Term, actor_terms
 from cotap.evaluation.policy import load_policy
 from cotap.files import write_atomically
 from cotap.robots import ROBOTS, RobotSpec
-from cotap.robots.mjcf import build_model
 
 OPSET = 20
 ORDER = "term by term; within a term oldest step first; a step in the order of the joints; each value times its scale"
@@ -39,66 +35,57 @@ FRAMES = (
 )
 
 
-class ActorGraph(nn.Module):
-    """What is exported: raw observation (N, W) to joint targets (N, J) [rad] and action (N, J).
+class TargetGraph(nn.Module):
+    """What is exported: raw observations (N, W) to joint targets (N, J) [rad]. The arms' reference is the newest one
+    observed."""
 
-    Steps and stance are fed forward from what the observation's newest step holds; the gait's phase is the angle of
-    its sine and cosine. The arms' reference is the one observed.
-    """
-
-    def __init__(self, model: DualActorCritic, targets: JointTargets, history: ObservationHistory) -> None:
+    def __init__(self, model: DualActorCritic, targets: JointTargets, clip: float, reference: slice) -> None:
         super().__init__()
         self.model = model
-        self._targets = targets
-        self._newest: dict[str, tuple[slice, float]] = {}
-        start = 0
-        for name, width, scale in history.terms:
-            end = start + width * history.steps
-            self._newest[name] = (slice(end - width, end), scale)
-            start = end
+        self._targets, self._clip, self._reference = targets, clip, reference
 
-    def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Joint targets and action."""
-        clip = self._targets.cfg.clip
-        action = self.model({"policy": observation}).clamp(-clip, clip)
-        seen = {name: observation[:, columns] / scale for name, (columns, scale) in self._newest.items()}
-        phase = torch.atan2(seen["sin_phase"], seen["cos_phase"]) / (2.0 * math.pi)
-        command = Command(
-            seen["command_velocity"], seen["command_yaw_rate"][:, 0], seen["command_stand"][:, 0],
-            seen["command_height"][:, 0], phase[:, 0].remainder(1.0),
-        )  # fmt: skip
-        targets = self._targets(
-            action, command, seen["joint_position"] + self._targets.default, seen["joint_velocity"],
-            seen["projected_gravity"], seen["torso_angular_velocity"], seen["reference_arm_position"],
-        )  # fmt: skip
-        return targets, action
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        """Joint targets."""
+        action = self.model({"policy": observation}).clamp(-self._clip, self._clip)
+        return self._targets(action, observation[:, self._reference])
+
+
+def newest(terms: tuple[Term, ...], history: int, wanted: str) -> slice:
+    """Columns of an observation that hold the newest step of the term called `wanted`."""
+    end = 0
+    for name, width, _ in terms:
+        end += width * history
+        if name == wanted:
+            return slice(end - width, end)
+    raise ValueError(f"the observation has no term {wanted!r}")
 
 
 def export_policy(checkpoint: Path | str, output: Path, checks: int = 1000, seed: int = 0) -> tuple[str, float]:
     """Write `output`, whole or not at all, once its numbers are found to be torch's.
 
-    Returns the metadata's summary and the largest difference from torch over `checks` observations.
+    Returns the metadata's summary and the largest difference from torch over `checks` observations [rad].
 
     Raises:
-        CheckpointError: the checkpoint cannot be used, or its observation is not the one that cotap builds.
+        CheckpointError: the checkpoint cannot be used, or its observation is not one that a robot can make.
         ArithmeticError: the file's numbers are not torch's.
         OSError: it cannot be written.
     """
     policy = load_policy(checkpoint)
     cfg = policy.env_config
     spec = ROBOTS[cfg.robot]()
-    history = ObservationHistory(actor_terms(len(spec.joints), len(spec.upper_joints)), 1, cfg.observations.history)
-    layout = {"joints": list(spec.joint_names), "terms": [list(t) for t in history.terms], "history": history.steps}
+    terms, history = terms_of(cfg, spec), cfg.observations.history
+    layout = {"joints": list(spec.joint_names), "terms": [list(t) for t in terms], "history": history}
     require_layout(checkpoint, policy.layout, layout)
-    targets = JointTargets(cfg.actions, spec, build_model(spec), cfg.commands)
-    graph = ActorGraph(policy.model, targets, history).eval()
-    metadata = describe(cfg, spec, targets, history, policy.model, policy.stage, sha256(checkpoint))
+    targets = JointTargets(cfg.actions, spec)
+    reference = newest(terms, history, "reference_arm_position")
+    graph = TargetGraph(policy.model, targets, cfg.actions.clip, reference).eval()
+    metadata = describe(cfg, spec, targets, policy.stage, sha256(checkpoint))
     worst = 0.0
 
     def write(temporary: Path) -> None:
         nonlocal worst
         _write_onnx(temporary, graph, metadata)
-        worst = largest_difference(OnnxPolicy(temporary), graph, typical_observations(graph, history, checks, seed))
+        worst = largest_difference(OnnxPolicy(temporary), graph, typical_observations(graph, checks, seed))
         if not worst <= 1e-5:
             raise ArithmeticError(f"the ONNX file's targets differ from torch's by up to {worst:.2e} rad")
 
@@ -106,70 +93,53 @@ def export_policy(checkpoint: Path | str, output: Path, checks: int = 1000, seed
     return f"{metadata.robot}, {metadata.stage}, opset {metadata.opset}", worst
 
 
+def terms_of(cfg: HumanoidEnvConfig, spec: RobotSpec) -> tuple[Term, ...]:
+    """Terms of the observation that a robot makes for a policy trained in `cfg`."""
+    return actor_terms(len(spec.joints), len(spec.upper_joints), cfg.observations.arm_torque == "actor")
+
+
 def describe(
-    cfg: H1EnvConfig, spec: RobotSpec, targets: JointTargets, history: ObservationHistory, model: DualActorCritic,
-    stage: str, checkpoint_sha256: str,
-) -> PolicyMetadata:  # fmt: skip
+    cfg: HumanoidEnvConfig, spec: RobotSpec, targets: JointTargets, stage: str, checkpoint_sha256: str
+) -> PolicyMetadata:
     """The metadata of a policy that was trained in the environment `cfg`."""
-    laws, joints = cfg.upper_body, spec.joints
-    sampling = to_plain(laws.sampling)
-    ranges = {name: sampling[name] for name in ("stiffness", "null_stiffness", "alpha")}
+    joints = spec.joints
     return PolicyMetadata(
         format=FORMAT,
         robot=spec.name,
         stage=stage,
         joints=list(spec.joint_names),
         default_pose_rad=[j.default_rad for j in joints],
-        action_scale_rad=[round(v, 9) for v in targets.scale.tolist()],
-        action_clip=cfg.actions.clip,
-        arm_action={"mode": cfg.actions.upper_mode, "reference_lead_s": cfg.actions.reference_lead_s},
-        agents={name: [s.start, s.stop] for name, s in model.layout.action_slices.items()},
         kp=[j.kp for j in joints],
         kd=[j.kd for j in joints],
         torque_limit_nm=[cfg.torque_limit_scale * j.torque_limit_nm for j in joints],
-        joint_range_rad=[list(j.range_rad) for j in joints],
-        velocity_limit_rad_s=[j.velocity_limit_rad_s for j in joints],
-        nominal_height_m=spec.nominal_height_m,
+        action={"scale_rad": [round(v, 9) for v in targets.scale.tolist()], "clip": cfg.actions.clip,
+                "upper_mode": cfg.actions.upper_mode},
+        observation={"terms": [list(t) for t in terms_of(cfg, spec)], "history": cfg.observations.history,
+                     "order": ORDER, "frames": FRAMES},
         control_dt=cfg.control_dt,
-        observation={"terms": [list(t) for t in history.terms], "history": history.steps, "order": ORDER,
-                     "frames": FRAMES},
-        commands=asdict(cfg.commands),
-        law={"left": to_plain(laws.left), "right": to_plain(laws.right), "torso": to_plain(laws.torso),
-             "singularity_ratio": laws.singularity_ratio, "ranges": ranges if laws.sampling.enabled else None},
+        gait=to_plain(cfg.gait),
+        commands=to_plain(cfg.commands),
+        nominal_height_m=spec.nominal_height_m,
+        terminations=to_plain(cfg.terminations),
+        law=to_plain(cfg.upper_body),
         checkpoint_sha256=checkpoint_sha256,
         cotap_version=__version__,
         opset=OPSET,
     )  # fmt: skip
 
 
-def typical_observations(graph: ActorGraph, history: ObservationHistory, count: int, seed: int) -> torch.Tensor:
-    """Observations (count, W) spread as the normaliser knows them, with stand flags and gait phases that can occur."""
+def typical_observations(graph: TargetGraph, count: int, seed: int) -> torch.Tensor:
+    """Observations (count, W) spread as the normaliser knows them."""
     rng = torch.Generator().manual_seed(seed)
     normalizer: Any = graph.model.normalizers["policy"]
-    spread = torch.randn(count, history.width * history.steps, generator=rng)
-    observations = normalizer.mean + normalizer.std * spread
-    stand = (torch.rand(count, generator=rng) < 0.5).float()
-    angle = 2.0 * math.pi * torch.rand(count, generator=rng)
-    values = {
-        "command_stand": stand,
-        "sin_phase": (1.0 - stand) * angle.sin(),
-        "cos_phase": (1.0 - stand) * angle.cos(),
-    }
-    start = 0
-    for name, width, _ in history.terms:
-        end = start + width * history.steps
-        if name in values:
-            observations[:, start:end] = values[name].unsqueeze(1)
-        start = end
-    return observations
+    return normalizer.mean + normalizer.std * torch.randn(count, normalizer.mean.shape[-1], generator=rng)
 
 
 @torch.no_grad()
-def largest_difference(policy: OnnxPolicy, graph: ActorGraph, observations: torch.Tensor) -> float:
-    """Largest difference of targets [rad] and actions over `observations` (N, W)."""
-    expected = np.concatenate([value.numpy() for value in graph(observations)], 1)
-    got = np.stack([np.concatenate(policy(row)) for row in observations.numpy()])
-    return float(np.abs(got - expected).max())
+def largest_difference(policy: OnnxPolicy, graph: TargetGraph, observations: torch.Tensor) -> float:
+    """Largest difference of targets [rad] over `observations` (N, W)."""
+    got = np.stack([policy(row) for row in observations.numpy()])
+    return float(np.abs(got - graph(observations).numpy()).max())
 
 
 @contextmanager
@@ -183,14 +153,14 @@ def _quiet(logger: logging.Logger) -> Iterator[None]:
         logger.setLevel(level)
 
 
-def _write_onnx(path: Path, graph: ActorGraph, metadata: PolicyMetadata) -> None:
+def _write_onnx(path: Path, graph: TargetGraph, metadata: PolicyMetadata) -> None:
     import onnx
 
     example = torch.zeros(1, metadata.observation_width)
     with warnings.catch_warnings(), _quiet(logging.getLogger("torch.onnx")):
         warnings.simplefilter("ignore")  # torch warns of its own coming changes
         program = torch.onnx.export(
-            graph, (example,), input_names=[INPUT], output_names=[TARGETS, ACTION], opset_version=OPSET, dynamo=True,
+            graph, (example,), input_names=[INPUT], output_names=[TARGETS], opset_version=OPSET, dynamo=True,
             verbose=False,
         )  # fmt: skip
     assert program is not None

@@ -1,4 +1,4 @@
-"""What motors are told for one control step: torque that is affine in the joints' state, in float64."""
+"""What motors do in one control step: torque that is affine in the joints' state, in float64."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class JointLaw:
         return JointLaw(share * self.bias, share * self.stiffness, self.damping)
 
     def with_arms(self, arms: TorqueLaw, first: int) -> JointLaw:
-        """The same with joints from `first` on under the law of world 0 of `arms`."""
+        """The same with joints from `first` on under the law of env 0 of `arms`."""
         bias, stiffness, damping = self.bias.copy(), self.stiffness.copy(), self.damping.copy()
         for arm in range(arms.anchor.shape[1]):
             k, d = arms.stiffness[0, arm].numpy(), arms.damping[0, arm].numpy()

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from cotap.checks import reason_of
-from cotap.deployment.metadata import ACTION, INPUT, TARGETS, PolicyError, PolicyMetadata, read_metadata
+from cotap.deployment.metadata import INPUT, TARGETS, PolicyError, PolicyMetadata, read_metadata
 
 
 class OnnxPolicy:
@@ -48,36 +48,28 @@ class OnnxPolicy:
         self.metadata = read_metadata(where, properties)
         joints, width = len(self.metadata.joints), self.metadata.observation_width
         self._require(where, "inputs", inputs, {INPUT: [1, width]})
-        wanted = {TARGETS: [1, joints], ACTION: [1, joints]}
-        self._require(where, "outputs", outputs, wanted)
+        self._require(where, "outputs", outputs, {TARGETS: [1, joints]})
         self._input = np.zeros((1, width), dtype=np.float32)
-        self._require_scale(where)
+        self._default = np.array(self.metadata.default_pose_rad)
+        self._scale = np.array(self.metadata.action["scale_rad"])
+        self._residual = self.metadata.action["upper_mode"] == "residual"
 
-    def __call__(self, observation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Joint targets (J,) [rad], for arms that are sent to the reference observed, and the action (J,) to observe
-        next, both float64.
-
-        Args:
-            observation: (width,).
-        """
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        """Joint targets (J,) [rad], float64, of an observation (width,); with residual arms, of the reference that was
+        observed."""
         self._input[0] = observation
-        targets, action = self._session.run([TARGETS, ACTION], {INPUT: self._input})
-        return np.asarray(targets, dtype=np.float64)[0], np.asarray(action, dtype=np.float64)[0]
+        (targets,) = self._session.run([TARGETS], {INPUT: self._input})
+        return np.asarray(targets, dtype=np.float64)[0]
 
-    def _require_scale(self, where: str) -> None:
-        """What is fed forward does not read the last action: with another one, targets move by scaled actions alone."""
-        observations, start = np.zeros((2, self._input.shape[1])), 0
-        for name, width, _ in self.metadata.observation["terms"]:
-            end = start + width * self.metadata.observation["history"]
-            observations[1, start:end] = name == "last_action"
-            start = end
-        try:
-            (targets, action), (moved, other) = (self(observation) for observation in observations)
-        except Exception as error:  # a graph that cannot be run fails in onnxruntime's own ways, which share no base
-            raise PolicyError(f"{where} cannot be run: {reason_of(error)}") from error
-        expected = np.array(self.metadata.action_scale_rad) * (other - action)
-        if not np.allclose(moved - targets, expected, rtol=0.0, atol=1e-4):
-            raise PolicyError(f"{where}: its targets do not move by metadata action_scale_rad times its actions")
+    def offset(self, arm_reference: np.ndarray) -> np.ndarray:
+        """What scaled actions are added to (J,) [rad], for the arms' reference (U,) [rad]."""
+        if not self._residual:
+            return self._default
+        return np.concatenate((self._default[: -len(arm_reference)], arm_reference))
+
+    def action(self, targets: np.ndarray, arm_reference: np.ndarray) -> np.ndarray:
+        """The action (J,) behind targets (J,) [rad] that were sent with the arms' reference (U,) [rad]."""
+        return (targets - self.offset(arm_reference)) / self._scale
 
     @staticmethod
     def _require(where: str, kind: str, found: Sequence[Any], wanted: dict[str, list[int]]) -> None:
@@ -85,22 +77,6 @@ class OnnxPolicy:
         if got != wanted:
             shown = {value.name: (value.type, value.shape) for value in found}
             raise PolicyError(f"{where} has {kind} {shown}; its metadata asks for float32 {wanted}")
-
-
-def arm_advance(
-    metadata: PolicyMetadata, observed: np.ndarray, position: np.ndarray, velocity: np.ndarray
-) -> np.ndarray:
-    """What to add to the arms' targets (U,) [rad]: they are sent where the reference will be, not where it was seen.
-
-    Args:
-        metadata: The policy's.
-        observed: (U,) reference arm position in the observation [rad].
-        position: (U,) reference at the end of the control step [rad].
-        velocity: (U,) its velocity then [rad/s].
-    """
-    if metadata.arm_action["mode"] != "residual":
-        return np.zeros_like(observed)
-    return position + metadata.arm_action["reference_lead_s"] * velocity - observed
 
 
 def inference_ms(policy: OnnxPolicy, calls: int = 2000) -> tuple[float, float]:

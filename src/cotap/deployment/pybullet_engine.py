@@ -9,13 +9,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from cotap.compliance.dynamics import GRAVITY_M_S2
 from cotap.deployment.engines import EngineConfig
 from cotap.deployment.joint_law import JointLaw
 from cotap.deployment.rotors import with_rotors
 from cotap.robots import RobotSpec
 from cotap.robots.urdf import urdf
-
-_GRAVITY = 9.81
 
 
 class PybulletEngine:
@@ -36,7 +35,7 @@ class PybulletEngine:
         self._model, self._names = with_rotors(spec), pybullet
         self._limit = cfg.torque_limit_scale * np.array([j.torque_limit_nm for j in spec.joints])
         self._bullet = bullet = BulletClient(pybullet.DIRECT)
-        bullet.setGravity(0.0, 0.0, -_GRAVITY)
+        bullet.setGravity(0.0, 0.0, -GRAVITY_M_S2)
         bullet.setPhysicsEngineParameter(
             fixedTimeStep=cfg.timestep, numSubSteps=0, numSolverIterations=50, deterministicOverlappingPairs=1
         )
@@ -133,9 +132,10 @@ class PybulletEngine:
 
     def _set_dynamics(self, cfg: EngineConfig) -> None:
         feet = {foot.body for foot in self._model.feet}
+        damping = {b.name: self._model.joint(b.joint).damping_nms_rad for b in self._model.bodies if b.joint}
         for name, link in self._links.items():
             self._bullet.changeDynamics(
-                self._robot, link, linearDamping=0.0, angularDamping=0.0, jointDamping=self._model.joint_damping,
+                self._robot, link, linearDamping=0.0, angularDamping=0.0, jointDamping=damping.get(name, 0.0),
                 lateralFriction=cfg.friction if name in feet else 1.0, rollingFriction=0.0, spinningFriction=0.0,
                 restitution=0.0, maxJointVelocity=1e3,
             )  # fmt: skip

@@ -86,7 +86,7 @@ class Robot:
         roll, pitch = 0.5 * error[:2]
         tilt = np.array([np.cos(roll) * np.cos(pitch), np.sin(roll) * np.cos(pitch), np.cos(roll) * np.sin(pitch),
                          np.sin(roll) * np.sin(pitch)])  # fmt: skip
-        position = np.array([0.0, 0.0, self.spec.nominal_height_m + START_LIFT_M])
+        position = np.array([0.0, 0.0, self.spec.base_height_m + START_LIFT_M])
         mass_scale = 1.0 + self.cfg.mass_error * rng.choice([-1.0, 1.0])
         low, high = self.cfg.delay_steps
         delay = int(rng.integers(low, high + 1))
@@ -109,7 +109,7 @@ class Robot:
         return self._kd
 
     def truth(self) -> RobotState:
-        """The state as it is: for measures and for the forces of the world, never for the controller."""
+        """The state as it is: for measures and for forces, never for the controller."""
         if self._truth is None:
             self._truth = self._reader.read()
         return self._truth

@@ -13,9 +13,9 @@ from cotap.checks import require_finite, require_range
 from cotap.compliance.laws import LawConfig
 from cotap.configs import from_plain
 from cotap.envs.commands import CommandSource
-from cotap.envs.forces import ForceProfile, ScriptedForces
-from cotap.envs.reference import ReferenceConfig, ReferenceMotion
+from cotap.envs.scripted_forces import ForceProfile, ScriptedForces
 from cotap.evaluation.law_options import parse_law
+from cotap.motions.reference import ReferenceConfig, ReferenceMotion
 from cotap.robots import RobotSpec
 
 if sys.version_info >= (3, 11):

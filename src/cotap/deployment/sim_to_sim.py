@@ -19,7 +19,7 @@ from cotap.agents.checkpoint import write_json
 from cotap.checks import require_positive_int, require_range
 from cotap.compliance.laws import LawConfig
 from cotap.configs import to_plain
-from cotap.deployment.controller import command_config, law_config, robot_of
+from cotap.deployment.controller import gait_config, law_config, robot_of
 from cotap.deployment.engines import EngineConfig, EngineState, make_engine
 from cotap.deployment.policy import OnnxPolicy
 from cotap.deployment.robot import Perturbations
@@ -27,8 +27,8 @@ from cotap.deployment.safety import SafetyConfig
 from cotap.deployment.scenario import Scenario, TimedCommand
 from cotap.deployment.trial import Trial, trajectory
 from cotap.deployment.workers import Workers
-from cotap.envs import H1EnvConfig
-from cotap.envs.forces import ForceProfile
+from cotap.envs import HumanoidEnvConfig
+from cotap.envs.scripted_forces import ForceProfile
 from cotap.envs.state import StateReader
 from cotap.envs.upper_body import UpperBody, UpperBodyConfig
 from cotap.evaluation.disturbance import ConstantLoad, Impact, window_measures
@@ -36,6 +36,7 @@ from cotap.evaluation.law_options import parse_law
 from cotap.evaluation.metrics import summarize, tracking_measures, wilson_interval
 from cotap.evaluation.periodic import amplitude as swing_amplitude
 from cotap.evaluation.periodic import elbow_joints
+from cotap.motions.elbow import elbow_index
 from cotap.robots import RobotSpec
 
 STAND = (TimedCommand(stand=True),)
@@ -130,11 +131,11 @@ def compare(path: Path, cfg: Comparison, jobs: int = 1, kept: Path | None = None
 def _parts(policy: OnnxPolicy, cfg: Comparison, run: Run) -> dict[str, Callable[[], dict[str, Any]]]:
     """Everything that is run in one engine, by name."""
     spec = robot_of(policy.metadata)
-    blow, load = Impact(onset=ONSET_S, episode_seconds=ONSET_S + 2.0), ConstantLoad(onset=ONSET_S)
+    impact, load = Impact(onset=ONSET_S, episode_seconds=ONSET_S + 2.0), ConstantLoad(onset=ONSET_S)
     load.episode_seconds = ONSET_S + 4.0
     return {
         "velocity-tracking": lambda: tracking(run(Scenario(cfg.seconds), cfg.trials), policy, cfg),
-        "impact": lambda: loads(run, spec, blow, cfg),
+        "impact": lambda: loads(run, spec, impact, cfg),
         "constant-load": lambda: loads(run, spec, load, cfg),
         "periodic-load": lambda: periodic(run, spec, cfg),
         "perturbations": lambda: {
@@ -167,14 +168,13 @@ def falls(trials: list[Trial]) -> dict[str, Any]:
 
 def tracking(trials: list[Trial], policy: OnnxPolicy, cfg: Comparison) -> dict[str, Any]:
     """Falls and tracking errors."""
-    gait = command_config(policy.metadata).gait_period_s
-    measures = tracking_measures(_trajectory(trials, cfg.seconds), gait)
+    measures = tracking_measures(_trajectory(trials, cfg.seconds), gait_config(policy.metadata).period_s)
     names = ("e_lin", "e_lin_gait", "e_yaw_gait", "e_height", "e_upper", "stand_drift", "swing_height")
     return falls(trials) | {"metrics": {name: summarize(measures[name], cfg.seed) for name in names}}
 
 
 def loads(run: Run, spec: RobotSpec, protocol: Impact, cfg: Comparison) -> dict[str, Any]:
-    """A blow or a held load on the left hand, standing, law by law."""
+    """An impact or a held load on the left hand, standing, law by law."""
     out: dict[str, Any] = {}
     force = ForceProfile(protocol.force, protocol.hand, protocol.onset, protocol.duration)
     scenario = Scenario(protocol.seconds, command=STAND, force=(force,))
@@ -246,14 +246,16 @@ def statics(spec: RobotSpec, laws: UpperBodyConfig, qpos: np.ndarray, force_z: f
     engine.reset(qpos, np.zeros(len(qpos) - 1), 1.0)
     reader = StateReader(spec, EngineState(engine), torch.float64)
     state = reader.read()
-    body = UpperBody(laws, spec, 1, H1EnvConfig().control_dt, torch.float64)
+    body = UpperBody(laws, spec, 1, HumanoidEnvConfig().control_dt, torch.float64)
     arms = state.joint_pos[:, len(spec.lower_joints) :]
     body.send(state, arms, torch.zeros_like(arms))
     to_heading = state.heading_w.transpose(1, 2) @ state.torso_rotation_w
     jacobian = (to_heading.unsqueeze(1) @ reader.arm_chains.jacobian(state.arms))[0]
     compliance = jacobian @ torch.linalg.inv(body.newest.stiffness[0]) @ jacobian.transpose(-1, -2)
+    elbows = [elbow_index(spec, arm) for arm in spec.arms]
     return [
-        (abs(float(jacobian[i, 2, -1])) * force_z, float(compliance[i, 2, 2]) * force_z) for i in range(len(spec.arms))
+        (abs(float(jacobian[i, 2, elbow])) * force_z, float(compliance[i, 2, 2]) * force_z)
+        for i, elbow in enumerate(elbows)
     ]
 
 

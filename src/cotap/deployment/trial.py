@@ -9,13 +9,13 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from cotap.deployment.controller import Controller
+from cotap.deployment.controller import Controller, termination_config
 from cotap.deployment.joint_law import damped_law
 from cotap.deployment.robot import Robot
 from cotap.deployment.safety import SafetyConfig, Watchdog
 from cotap.deployment.scenario import Scenario
 from cotap.envs.state import RobotState
-from cotap.envs.terminations import TerminationConfig, diverged, fallen
+from cotap.envs.terminations import diverged, fallen
 from cotap.evaluation.rollout import Trajectory, arm_static_torque
 
 Pilot = Callable[[Controller, float], bool]
@@ -71,7 +71,8 @@ def run_trial(
         commands[0].give(controller.commands, robot.spec.nominal_height_m)
     start_up(robot, controller, safety, seed)
     watchdog = Watchdog(safety, robot.spec.joint_names, robot.torque_limit, dt)
-    forces, falling = scenario.forces(robot.spec, dt, seed), TerminationConfig()
+    forces, falling = scenario.forces(robot.spec, dt, seed), termination_config(controller.metadata)
+    min_height_m = falling.min_height_m(robot.spec)
     left = math.inf
     for k in range(round(scenario.seconds / dt)):
         while commands and commands[0].at <= k * dt + 1e-9:
@@ -97,7 +98,7 @@ def run_trial(
             trial.fell, trial.stopped = True, trial.stopped or "the simulation diverged"
             break
         truth = robot.truth()
-        down = bool(fallen(falling, truth.height, truth.projected_gravity_t))
+        down = bool(fallen(truth.height, truth.projected_gravity_t, min_height_m, falling.max_tilt_rad))
         trial.fell = trial.fell or down or bool(trial.stopped)
         for pair in () if trial.fell else sorted(robot.engine.touching()):
             name = " and ".join(pair)
@@ -114,7 +115,7 @@ def run_trial(
 def _row(
     robot: Robot, controller: Controller, s: RobotState, force_h: np.ndarray, fell: bool
 ) -> dict[str, torch.Tensor]:
-    c = controller.commands.current()
+    asked = controller.commands
     first = len(robot.spec.lower_joints)
     reference = controller.motion.current().position.double()
     torque = torch.from_numpy(robot.torque()).unsqueeze(0)
@@ -123,11 +124,10 @@ def _row(
     limit = torch.from_numpy(robot.torque_limit)[first:]
     return {
         "velocity": torch.cat((s.torso_linear_velocity_h[:, :2], s.yaw_rate.unsqueeze(1)), 1),
-        "command": torch.cat((c.velocity_h, c.yaw_rate.unsqueeze(1)), 1),
-        "stand": c.stand > 0.5,
-        "told_to_stand": controller.commands.told_to_stand,
+        "command": asked.asked_velocity.clone(),
+        "stand": asked.asked_to_stand,
         "height": s.height,
-        "height_command": c.height,
+        "height_command": asked.asked_height.clone(),
         "position": s.torso_pos_w[:, :2],
         "arm_error": s.joint_pos[:, first:] - reference,
         "arm_velocity": s.joint_vel[:, first:],
@@ -145,7 +145,7 @@ def _row(
 
 
 def trajectory(trials: list[Trial], steps: int) -> Trajectory:
-    """Trials as worlds (T, N, ...). A trial that ended early is fallen from then on; its last row is repeated."""
+    """Trials as envs (T, N, ...). A trial that ended early is fallen from then on; its last row is repeated."""
     columns: dict[str, list[torch.Tensor]] = {}
     for trial in trials:
         rows = trial.rows[:steps]

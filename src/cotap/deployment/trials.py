@@ -13,23 +13,23 @@ import torch
 from tqdm import tqdm
 
 from cotap.configs import to_plain
-from cotap.deployment.controller import Controller, command_config, robot_of
+from cotap.deployment.controller import Controller, command_config, gait_config, robot_of
 from cotap.deployment.engines import EngineConfig, make_engine
 from cotap.deployment.policy import OnnxPolicy
 from cotap.deployment.robot import Perturbations, Robot
 from cotap.deployment.safety import SafetyConfig
 from cotap.deployment.scenario import Scenario
 from cotap.deployment.trial import Pilot, Trial, run_trial, trajectory
-from cotap.envs import H1EnvConfig
+from cotap.envs import HumanoidEnvConfig
 from cotap.envs.commands import CommandConfig
 from cotap.envs.upper_body import UpperBodyConfig
 from cotap.evaluation.metrics import summarize, tracking_measures
-from cotap.evaluation.protocols import VelocityTracking
+from cotap.evaluation.velocity_tracking import VelocityTracking
 
 
 def evaluation_commands(commands: CommandConfig) -> CommandConfig:
     """Random commands as the velocity-tracking evaluation draws them, approached as in training."""
-    return VelocityTracking().configure(H1EnvConfig(commands=replace(commands))).commands
+    return VelocityTracking().configure(HumanoidEnvConfig(commands=replace(commands))).commands
 
 
 def run_trials(
@@ -57,14 +57,13 @@ def report(
     trials: list[Trial], policy_path: Path | str, policy: OnnxPolicy, laws: UpperBodyConfig, engine_cfg: EngineConfig,
     perturbations: Perturbations, safety: SafetyConfig, scenario: Scenario, seed: int, started: float,
 ) -> dict[str, Any]:  # fmt: skip
-    """What `--json` writes; measures as the velocity-tracking evaluation takes them, worlds being trials."""
+    """What `--json` writes; measures as the velocity-tracking evaluation takes them, with trials for envs."""
     steps = max(1, round(scenario.seconds / policy.metadata.control_dt))
     recorded = [trial for trial in trials if trial.rows]
     measures: dict[str, torch.Tensor] = {}
     if recorded:
         steps = min(steps, max(len(trial.rows) for trial in recorded))
-        gait = command_config(policy.metadata).gait_period_s
-        measures = tracking_measures(trajectory(recorded, steps), gait)
+        measures = tracking_measures(trajectory(recorded, steps), gait_config(policy.metadata).period_s)
         measures.pop("e_path")
     return {
         "protocol": "deploy",

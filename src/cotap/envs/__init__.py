@@ -1,5 +1,9 @@
-"""The environment: an rsl_rl VecEnv of H1 robots, and the components it is made of."""
+"""The environment: an rsl_rl VecEnv of humanoids, and the components it is made of."""
 
-from cotap.envs.h1_env import H1Env, H1EnvConfig
+from cotap.envs.config import HumanoidEnvConfig
+from cotap.envs.humanoid_env import HumanoidEnv
 
-__all__ = ["H1Env", "H1EnvConfig"]
+H1Env, H1EnvConfig = HumanoidEnv, HumanoidEnvConfig
+"""Their former names, for one release."""
+
+__all__ = ["H1Env", "H1EnvConfig", "HumanoidEnv", "HumanoidEnvConfig"]

@@ -9,8 +9,8 @@ import torch
 from cotap.compliance.dynamics import gravity_torque, joint_inertia
 from cotap.compliance.force_estimation import hand_force, observe_torque
 from cotap.compliance.interface import Arms
-from cotap.envs.persistence import Stateful
 from cotap.envs.state import RobotState
+from cotap.persistence import Stateful
 
 TIME_CONSTANT_S = 0.05
 """Of the estimate's low pass."""

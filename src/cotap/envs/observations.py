@@ -10,8 +10,8 @@ import torch
 
 from cotap.checks import require_one_of, require_range
 from cotap.envs.commands import Command
-from cotap.envs.persistence import Stateful
 from cotap.envs.state import RobotState
+from cotap.persistence import Stateful
 
 
 @dataclass
@@ -38,6 +38,8 @@ class ObservationConfig:
     """Steps of history, the present one included."""
     arm_torque: str = "actor"
     """Who sees the arms' torque: actor (and so the critic), or critic alone (the paper's ablation)."""
+    critic: str = "present"
+    """What critics see beside what is privileged: the present step, or all the history that actors see (the paper)."""
     goals: bool = False
     """Whether the actor sees the arms' stiffness, null-space stiffness and alpha as they are commanded."""
     noise: NoiseConfig = field(default_factory=NoiseConfig)
@@ -46,6 +48,7 @@ class ObservationConfig:
         """Raise ValueError naming the first field that is out of its range."""
         require_range("observations.history", self.history, 1, 100)
         require_one_of("observations.arm_torque", self.arm_torque, ("actor", "critic"))
+        require_one_of("observations.critic", self.critic, ("present", "history"))
         for name in ("angular_velocity", "gravity", "joint_position", "joint_velocity"):
             require_range(f"observations.noise.{name}", getattr(self.noise, name), 0.0, 100.0)
 
@@ -140,20 +143,24 @@ class ObservationHistory(Stateful):
         return torch.cat([values[name] for name, _, _ in self.terms], 1) * self.scale
 
     def append(self, present: torch.Tensor, restarted: torch.Tensor) -> torch.Tensor:
-        """Add `present` (N, width), already scaled; worlds in `restarted` (N,) fill their history with it.
+        """Add `present` (N, width), already scaled; envs in `restarted` (N,) fill their history with it.
 
         Returns the new buffer (N, width * steps), which later calls do not change.
         """
+        self.buffer = self.with_next(present)
+        if restarted.any():
+            fresh = [t.repeat(1, self.steps) for t in present[restarted].split(self._widths, 1)]
+            self.buffer[restarted] = torch.cat(fresh, 1)
+        return self.buffer
+
+    def with_next(self, present: torch.Tensor) -> torch.Tensor:
+        """What the history (N, width * steps) would be with `present` (N, width) added."""
         pieces: list[torch.Tensor] = []
         start = 0
         for width, term in zip(self._widths, present.split(self._widths, 1), strict=True):
             pieces += (self.buffer[:, start + width : start + width * self.steps], term)
             start += width * self.steps
-        self.buffer = torch.cat(pieces, 1)
-        if restarted.any():
-            fresh = [t.repeat(1, self.steps) for t in present[restarted].split(self._widths, 1)]
-            self.buffer[restarted] = torch.cat(fresh, 1)
-        return self.buffer
+        return torch.cat(pieces, 1)
 
 
 def noise_amplitude(terms: tuple[Term, ...], cfg: NoiseConfig) -> torch.Tensor:

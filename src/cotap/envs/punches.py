@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from cotap.checks import require_range
-from cotap.envs.persistence import Stateful, uniform
+from cotap.persistence import Stateful, uniform
 
 
 @dataclass
@@ -29,7 +29,7 @@ class PunchConfig:
 
 
 class Punches(Stateful):
-    """The blow that each of N worlds takes in its present segment, on one of `num_joints` arm joints."""
+    """The blow that each of N envs takes in its present segment, on one of `num_joints` arm joints."""
 
     STATE = ("joint", "_force_w", "_start_s", "_left_s")
 
@@ -44,7 +44,7 @@ class Punches(Stateful):
         self._start_s, self._left_s = torch.zeros(num_envs), torch.zeros(num_envs)
 
     def reset(self, mask: torch.Tensor, rng: torch.Generator) -> None:
-        """A new segment with a new blow for the worlds of `mask`."""
+        """A new segment with a new blow for the envs of `mask`."""
         n = int(mask.sum())
         if not self.active or n == 0:
             return

@@ -8,23 +8,23 @@ from typing import ClassVar
 import torch
 
 from cotap.checks import require_interval, require_range
-from cotap.envs.persistence import Stateful, uniform
+from cotap.persistence import Stateful, uniform
 from cotap.robots import RobotSpec
 from cotap.sim import Simulation
 
 
 @dataclass
 class RandomizationConfig:
-    """Ranges, drawn uniformly per world: body properties once, the others at every episode."""
+    """Ranges, drawn uniformly per env: body properties once, the others at every episode."""
 
     enabled: bool = True
-    """Whether worlds differ at all."""
+    """Whether envs differ at all."""
     friction: tuple[float, float] = (0.5, 1.25)
     """Sliding friction of the feet."""
     link_mass_scale: tuple[float, float] = (0.9, 1.2)
     """Factor on each link's mass and inertia."""
     base_mass_kg: tuple[float, float] = (-1.0, 3.0)
-    """Added to the base [kg]."""
+    """Added to the torso link, the paper's base [kg]."""
     delay_s: tuple[float, float] = (0.0, 0.02)
     """Control delay [s], at most one control step."""
     kp_scale: tuple[float, float] = (0.9, 1.1)
@@ -54,14 +54,14 @@ class Randomizer(Stateful):
         model = sim.model
         feet = {model.body(foot.body).id for foot in spec.feet}
         self._foot_geoms = [g for g in range(model.ngeom) if model.geom_bodyid[g] in feet and model.geom_contype[g]]
-        self._base = model.body(spec.base_body).id
+        self._torso = model.body(spec.torso_body).id
         self._kp = torch.tensor([j.kp for j in spec.joints], dtype=torch.float64)
         self._kd = torch.tensor([j.kd for j in spec.joints], dtype=torch.float64)
         self.kp_scale = torch.ones(sim.num_envs, len(spec.joints))
         self.kd_scale = torch.ones(sim.num_envs, len(spec.joints))
 
     def randomize_bodies(self, rng: torch.Generator) -> None:
-        """Draw masses and inertias of all worlds; slow, so done once."""
+        """Draw masses and inertias of all envs; slow, so done once."""
         cfg = self.cfg
         if not cfg.enabled:
             return
@@ -70,19 +70,19 @@ class Randomizer(Stateful):
         self.set_mass(scale, uniform(rng, *cfg.base_mass_kg, n))
 
     def set_mass(self, scale: torch.Tensor, added_kg: torch.Tensor) -> None:
-        """Give every world's links their nominal mass and inertia times `scale` (N, bodies), the base more (N,)."""
+        """Give every env's links their nominal mass and inertia times `scale` (N, bodies), the torso more (N,)."""
         mass, inertia = self._sim.field("body_mass"), self._sim.field("body_inertia")
         nominal = torch.as_tensor(self._sim.model.body_mass, device=mass.device)
         scaled = nominal * scale.double()
-        # Mass added to the base is spread as the base's own.
-        scaled[:, self._base] += added_kg.double()
+        # Mass added to the torso is spread as the torso's own.
+        scaled[:, self._torso] += added_kg.double()
         ratio = torch.where(nominal > 0.0, scaled / nominal.clamp_min(1e-12), torch.ones_like(scaled))
         mass.copy_(scaled)
         inertia.copy_(torch.as_tensor(self._sim.model.body_inertia, device=mass.device) * ratio.unsqueeze(-1))
         self._sim.update_constants()
 
     def randomize_episode(self, mask: torch.Tensor, delay_s: torch.Tensor, rng: torch.Generator) -> None:
-        """Draw friction, gains and delay of the worlds in `mask`; `delay_s` (num_envs,) is written in place."""
+        """Draw friction, gains and delay of the envs in `mask`; `delay_s` (num_envs,) is written in place."""
         cfg, n = self.cfg, int(mask.sum())
         if n == 0 or not cfg.enabled:
             return
@@ -94,13 +94,13 @@ class Randomizer(Stateful):
         self.write_gains(mask)
 
     def set_friction(self, mask: torch.Tensor, sliding: torch.Tensor) -> None:
-        """Give the feet in the worlds of `mask` (N,) the sliding friction `sliding` (n,)."""
+        """Give the feet in the envs of `mask` (N,) the sliding friction `sliding` (n,)."""
         friction = self._sim.field("geom_friction")
         for geom in self._foot_geoms:
             friction[mask, geom, 0] = sliding.to(friction)
 
     def write_gains(self, mask: torch.Tensor) -> None:
-        """Bring the actuators' gains of the worlds in `mask` in line with the scales."""
+        """Bring the actuators' gains of the envs in `mask` in line with the scales."""
         bias = self._sim.field("actuator_biasprm")
         bias[mask, :, 1] = (-self._kp * self.kp_scale[mask].double()).to(bias)
         bias[mask, :, 2] = (-self._kd * self.kd_scale[mask].double()).to(bias)

@@ -18,7 +18,7 @@ CONTACT_FORCE_N = 5.0
 
 @dataclass(frozen=True)
 class RobotState:
-    """N worlds. Suffixes name frames: `_w` world, `_t` torso link, `_h` heading (z up, x along the torso's yaw).
+    """N envs. Suffixes name frames: `_w` world, `_t` torso link, `_h` heading (z up, x along the torso's yaw).
 
     Joints and all that follows from them are current; the four `foot_*` tensors come from sensors and are one
     physics step older (the simulation's contract).
@@ -72,8 +72,8 @@ class RobotState:
         """(N, A, 3) where the hand points are [m]."""
         return self.torso_pos_w.unsqueeze(1) + self.arms.tip @ self.torso_rotation_w.transpose(1, 2)
 
-    def with_worlds(self, ids: torch.Tensor, other: RobotState) -> RobotState:
-        """A copy in which the worlds `ids` (n,) are in the state of `other`, which has n worlds."""
+    def with_envs(self, ids: torch.Tensor, other: RobotState) -> RobotState:
+        """A copy in which the envs `ids` (n,) are in the state of `other`, which has n envs."""
         return _with_rows(self, ids, other)
 
 
@@ -81,7 +81,7 @@ _Rows = TypeVar("_Rows", RobotState, ChainPose)
 
 
 def _with_rows(mine: _Rows, ids: torch.Tensor, other: _Rows) -> _Rows:
-    """A copy of `mine`, worlds first in every tensor, with `other` in the rows `ids`."""
+    """A copy of `mine`, envs first in every tensor, with `other` in the rows `ids`."""
     values = {}
     for f in fields(mine):
         value, new = getattr(mine, f.name), getattr(other, f.name)
@@ -129,7 +129,7 @@ class StateReader:
         return values[:, self._arm_ids].unflatten(1, (self._num_arms, -1))
 
     def read(self, ids: torch.Tensor | None = None) -> RobotState:
-        """The state now, of all worlds or of the worlds `ids` (n,)."""
+        """The state now, of all envs or of the envs `ids` (n,)."""
         rows = slice(None) if ids is None else ids
         qpos, qvel = self._source.qpos[rows].to(self._dtype), self._source.qvel[rows].to(self._dtype)
         q, dq = qpos[:, 7:], qvel[:, 6:]

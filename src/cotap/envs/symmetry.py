@@ -35,7 +35,7 @@ def joint_reflection(spec: RobotSpec, joints: tuple[str, ...]) -> Reflection:
 
 
 def _term_reflection(spec: RobotSpec, name: str, width: int) -> Reflection:
-    if width == len(spec.joints):
+    if name in ("joint_position", "joint_velocity", "last_action"):
         return joint_reflection(spec, spec.joint_names)
     if name in ("reference_arm_position", "arm_torque"):
         return joint_reflection(spec, spec.upper_joints)

@@ -13,8 +13,8 @@ from cotap.compliance.interface import ArmState, LawParameters, Remembering, Tor
 from cotap.compliance.laws import LAWS, LawConfig
 from cotap.compliance.torso import chain_compliance, hand_base_compliance, torso_compliance
 from cotap.envs.hand_sensing import HandSensors
-from cotap.envs.persistence import Stateful, restored, uniform
 from cotap.envs.state import RobotState
+from cotap.persistence import Stateful, restored, uniform
 from cotap.robots import RobotSpec
 from cotap.robots.chains import arm_model, chains_between
 
@@ -44,7 +44,9 @@ class LawSampling:
     enabled: bool = False
     """Whether they are drawn; otherwise they stay as the laws' configs have them."""
     stiffness: tuple[float, float] = (80.0, 1200.0)
-    """Hand stiffness, each axis by itself, log-uniform [N/m]."""
+    """Hand stiffness, each axis by itself [N/m]."""
+    log_uniform: bool = True
+    """Draw the logarithm of stiffness uniformly, or else (the paper) stiffness itself."""
     null_stiffness: tuple[float, float] = (24.0, 56.0)
     """Uniform [Nm/rad]."""
     alpha: tuple[float, float] = (0.0, 1.0)
@@ -138,14 +140,15 @@ class UpperBody(Stateful):
             ValueError: a field of `law` is out of its range.
         """
         law.check()
+        under_it = self._mask(law)  # which refuses a law that these arms cannot have, before anything is changed
         p = self.parameters
         p.stiffness[world, arm] = torch.tensor(law.stiffness)
         p.null_stiffness[world, arm], p.alpha[world, arm] = law.null_stiffness, law.alpha
-        if self._mask(law)[world, arm]:
+        if under_it[world, arm]:
             return
         for _, _, mine in self._laws.values():
             mine[world, arm] = False
-        self._mask(law)[world, arm] = True
+        under_it[world, arm] = True
         self._laws = {kind: driven for kind, driven in self._laws.items() if driven[2].any()}
         self.sensors.estimates = any(config.sensing == "estimated" for _, config, _ in self._laws.values())
         self.fresh[world] = True
@@ -178,8 +181,9 @@ class UpperBody(Stateful):
         if n == 0:
             return
         cfg, p = self._cfg.sampling, self.parameters
-        low, high = (math.log(bound) for bound in cfg.stiffness)
-        p.stiffness[mask] = uniform(rng, low, high, n, arms, 3).exp()
+        low, high = (math.log(bound) for bound in cfg.stiffness) if cfg.log_uniform else cfg.stiffness
+        drawn = uniform(rng, low, high, n, arms, 3)
+        p.stiffness[mask] = drawn.exp() if cfg.log_uniform else drawn
         p.null_stiffness[mask] = uniform(rng, *cfg.null_stiffness, n, arms)
         full = torch.rand(n, arms, generator=rng, device=rng.device) < cfg.full_alpha
         p.alpha[mask] = torch.where(full, cfg.alpha[1], uniform(rng, *cfg.alpha, n, arms))

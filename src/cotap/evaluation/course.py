@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from cotap.envs.persistence import uniform
+from cotap.persistence import uniform
 from cotap.rotations import rotate, rotate_inverse
 
 STEERING = 1.5
@@ -24,7 +24,7 @@ def steer(ahead_h: torch.Tensor, speed: float) -> tuple[torch.Tensor, torch.Tens
 
 
 class Course:
-    """Waypoints of N worlds, each `leg` from the one before in a direction that changes by up to `turn`.
+    """Waypoints of N envs, each `leg` from the one before in a direction that changes by up to `turn`.
 
     Args:
         count: Number of waypoints.
@@ -33,7 +33,7 @@ class Course:
         radius: Distance at which one is reached [m].
         num_envs: N.
         rng: Draws the turns.
-        device: Where the worlds are.
+        device: Where the envs are.
     """
 
     def __init__(
@@ -45,9 +45,9 @@ class Course:
         self._radius = radius
         self._points_w = torch.zeros(num_envs, count, 2, device=device)
         self.reached = torch.zeros(num_envs, dtype=torch.long, device=device)
-        """(N,) how many waypoints each world has reached."""
+        """(N,) how many waypoints each env has reached."""
         self.over = torch.zeros(num_envs, dtype=torch.bool, device=device)
-        """(N,) worlds that reach no more."""
+        """(N,) envs that reach no more."""
 
     def start(self, position_w: torch.Tensor, heading_w: torch.Tensor) -> None:
         """Lay the course out from positions (N, 2), its first direction about the headings (N, 3, 3)."""
@@ -55,7 +55,7 @@ class Course:
         self._points_w = position_w.unsqueeze(1) + steps_w.cumsum(1)
 
     def leave(self, fell: torch.Tensor) -> None:
-        """Worlds (N,) bool that are out of it from now on."""
+        """Envs (N,) bool that are out of it from now on."""
         self.over = self.over | fell
 
     def step(self, position_w: torch.Tensor, heading_w: torch.Tensor) -> torch.Tensor:

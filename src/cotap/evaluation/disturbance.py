@@ -11,9 +11,10 @@ import torch
 
 from cotap.checks import require_range
 from cotap.compliance.laws import WITHOUT_STIFFNESS
-from cotap.envs import H1Env, H1EnvConfig
-from cotap.envs.forces import ForceProfile
+from cotap.envs import HumanoidEnv, HumanoidEnvConfig
+from cotap.envs.scripted_forces import ForceProfile
 from cotap.evaluation.metrics import masked_mean, summaries
+from cotap.evaluation.protocol import HELD, MIXTURE
 from cotap.evaluation.report import save_figure
 from cotap.evaluation.rollout import Trajectory
 from cotap.evaluation.scenario import Scenario
@@ -21,22 +22,24 @@ from cotap.evaluation.transient import back_within, transient_measures
 
 BEFORE_S = 0.5
 """What a hand does in this time before the onset is what it is compared with afterwards [s]."""
-BLOW_S = 0.1
-"""The time from the onset in which an arm takes a blow [s]."""
+PUSH_S = 0.1
+"""The time from the onset in which an arm takes a push [s]."""
 LEAST_WAY_M = 0.005
-"""A load that moves the hand less than this has no overshoot that could be told from sway [m]."""
+"""A load that moves the hand less than this has no overshoot beside its sway [m]."""
 
 
 @dataclass
 class Impact(Scenario):
-    """A blow on a hand: 500 N for 50 ms."""
+    """A push on a hand or the base, 500 N for 50 ms: errors of hand, arm and torso, torques, recovery, falls."""
 
+    motion: tuple[str, ...] = (MIXTURE,)
+    """Clips that the arms follow, `mixture` for what the policy was trained on, or `none` to hold `arm_pose`."""
     force: tuple[float, float, float] = (500.0, 0.0, 0.0)
     """Along x, y and z of the heading frame [N]."""
     hand: str = "left"
     """left, right or both."""
     place: str = "hand"
-    """hand, or base: an unannounced push on the pelvis and on no hand."""
+    """hand, or base: at its centre of mass, and on no hand."""
     duration: float = 0.05
     """How long the force lasts [s]."""
     random_direction: bool = False
@@ -45,10 +48,12 @@ class Impact(Scenario):
     """When it sets in [s]."""
     window: tuple[float, float] = (0.0, 1.0)
     """What is measured, from the onset [s]."""
-    episode_seconds: float = 3.0
+    fall_seconds: float = 3.0
+    """Falls count up to this long after the onset [s]."""
+    episode_seconds: float = 4.0
     """Length of the evaluation [s]."""
     worlds: bool = False
-    """Write every world's figures as well: `python -m cotap.compare` then compares world by world."""
+    """Write every env's figures as well: `python -m cotap.compare` then compares env by env."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
@@ -56,31 +61,30 @@ class Impact(Scenario):
         require_range("onset", self.onset, BEFORE_S, 3600.0)
         require_range("window[0]", self.window[0], 0.0, 3600.0)
         require_range("window[1]", self.window[1], self.window[0] + 0.02, 3600.0)
-        require_range("episode_seconds", self.episode_seconds, self.onset + self.window[1], 1e4)
+        require_range("fall_seconds", self.fall_seconds, 0.02, 3600.0)
+        require_range("episode_seconds", self.episode_seconds, self.onset + max(self.window[1], self.fall_seconds), 1e4)
         self._profile().check()
 
     def _profile(self) -> ForceProfile:
-        return ForceProfile(
-            self.force, self.hand, self.onset, self.duration, 0.0, self.random_direction, self.place
-        )  # fmt: skip
+        return ForceProfile(self.force, self.hand, self.onset, self.duration, 0.0, self.random_direction, self.place)
 
     @property
     def seconds(self) -> float:
         """Length of the evaluation [s]."""
         return self.episode_seconds
 
-    def configure(self, env: H1EnvConfig) -> H1EnvConfig:
-        """Turn the environment that a policy was trained in into this protocol's. Changes and returns `env`."""
-        super().configure(env)
-        env.force = self._profile()
-        return env
+    def configure(self, env_cfg: HumanoidEnvConfig) -> HumanoidEnvConfig:
+        """Turn the environment that a policy was trained in into this protocol's. Changes and returns `env_cfg`."""
+        super().configure(env_cfg)
+        env_cfg.forces.scripted = self._profile()
+        return env_cfg
 
-    def hit(self, env: H1Env) -> list[int]:
+    def hit(self, env: HumanoidEnv) -> list[int]:
         """Indices of the hands whose error is `e_ee_hit`: those that the force is on, all for a force on the base."""
         return [i for i, a in enumerate(env.spec.arms) if self.place == "base" or self.hand in (a.side, "both")]
 
-    def measure(self, trajectory: Trajectory, env: H1Env) -> dict[str, Any]:
-        """The measured part of the evaluation's JSON."""
+    def measure(self, trajectory: Trajectory, env: HumanoidEnv) -> dict[str, Any]:
+        """The measured part of the evaluation's JSON, the number of falls aside."""
         t, hit = trajectory, self.hit(env)
         onset = round(self.onset / t.dt)
         begin, end = (onset + round(bound / t.dt) for bound in self.window)
@@ -89,15 +93,17 @@ class Impact(Scenario):
         window = window_measures(t, begin, end, hit)
         if any(self.force):
             window |= response_measures(t, onset, begin, end, hit)
-            window["j_upper_blow"] = window_measures(t, onset, onset + round(BLOW_S / t.dt), hit)["j_upper"]
+            window["j_upper_blow"] = window_measures(t, onset, onset + round(PUSH_S / t.dt), hit)["j_upper"]
         release = onset + round(self.duration / t.dt)
         if any(self.force) and release < end:
             window |= transient_measures(t, onset, release, end, hit, BEFORE_S)
         elif any(self.force) and self.place == "hand":
             window["load_overshoot"] = load_overshoot(t, onset, begin, end, hit)
+        fall_end = onset + round(self.fall_seconds / t.dt)
+        window["fall_fraction"] = t.fell[:fall_end].any(0)
         episode = window_measures(t, 0, len(t.fell), hit)
         return {
-            "falls": falls_by_time(t, onset, end),
+            "falls": falls_by_time(t, onset, fall_end),
             "metrics": summaries(window, everyone, self.seed),
             "metrics_without_falls": summaries(window, stood, self.seed),
             "window": {"start": self.onset + self.window[0], "end": self.onset + self.window[1]},
@@ -110,8 +116,8 @@ class Impact(Scenario):
             **({"worlds": per_world(window, stood)} if self.worlds else {}),
         } | self._stiffness(env, window, stood)
 
-    def _stiffness(self, env: H1Env, measures: dict[str, torch.Tensor], stood: torch.Tensor) -> dict[str, Any]:
-        """Force over displacement, where the load is held and is the same in all worlds."""
+    def _stiffness(self, env: HumanoidEnv, measures: dict[str, torch.Tensor], stood: torch.Tensor) -> dict[str, Any]:
+        """Force over displacement, where the load is held and is the same in all envs."""
         law = env.cfg.upper_body.of(env.spec.arms[self.hit(env)[0]].side)
         commanded = list(law.stiffness) if law.name not in WITHOUT_STIFFNESS else None
         reason = ""
@@ -120,7 +126,7 @@ class Impact(Scenario):
         elif self.duration < self.window[1]:
             reason = "the force is over before the window is"
         elif self.random_direction:
-            reason = "the force's direction differs between worlds"
+            reason = "the force's direction differs between envs"
         if reason:
             return {"effective_stiffness": {"commanded": commanded, "measured": None, "reason": reason}}
         measured: list[float | None] = []
@@ -130,11 +136,11 @@ class Impact(Scenario):
             measured.append(force / float(moved["mean"] or 0.0) if force != 0.0 and low * high > 0.0 else None)
         out = {"commanded": commanded, "measured": measured}
         if None in measured:
-            out["reason"] = "null: no force along that axis, or a displacement that cannot be told from zero"
+            out["reason"] = "null: no force along that axis, or a displacement whose interval has zero in it"
         return {"effective_stiffness": out}
 
     def plot(self, path: Path, result: dict[str, Any]) -> None:
-        """Hand error, torso velocity error and arm torque over time, means over the worlds that stood."""
+        """Hand error, torso velocity error and arm torque over time, means over the envs that stood."""
         import matplotlib
 
         matplotlib.use("Agg")
@@ -156,20 +162,24 @@ class Impact(Scenario):
 
 @dataclass
 class ConstantLoad(Impact):
-    """A load on a hand, held: 50 N downward."""
+    """A load on a hand, held, 50 N downward: errors of hand, arm and torso, torques, effective stiffness, falls."""
 
+    motion: tuple[str, ...] = (HELD,)
+    """Clips that the arms follow, `mixture` for what the policy was trained on, or `none` to hold `arm_pose`."""
     force: tuple[float, float, float] = (0.0, 0.0, -50.0)
     """Along x, y and z of the heading frame [N]."""
     duration: float = 1e5
     """How long the force lasts [s]."""
     window: tuple[float, float] = (2.0, 4.0)
     """What is measured, from the onset [s]."""
+    fall_seconds: float = 4.0
+    """Falls count up to this long after the onset [s]."""
     episode_seconds: float = 5.0
     """Length of the evaluation [s]."""
 
 
 def window_measures(t: Trajectory, begin: int, end: int, hit: list[int]) -> dict[str, torch.Tensor]:
-    """Measures of the steps from `begin` to before `end` per world, (N,) each, up to a fall; NaN for a world with none.
+    """Measures of the steps from `begin` to before `end` per env, (N,) each, up to a fall; NaN for an env with none.
 
     Hand errors are against the reference carried in the torso frame; `e_ee_hit` is that of the hands in `hit`. Torques
     are those at the ends of control steps, `peak_torque` the largest of any arm joint, `energy` the integral of
@@ -199,7 +209,7 @@ def window_measures(t: Trajectory, begin: int, end: int, hit: list[int]) -> dict
 
 
 def per_world(measures: dict[str, torch.Tensor], stood: torch.Tensor) -> dict[str, list[float | None]]:
-    """Measures (N,) world by world, to six digits, null where a world has none; and whether it `stood` to the end."""
+    """Measures (N,) env by env, to six digits, null where an env has none; and whether it `stood` to the end."""
 
     def plain(value: float) -> float | None:
         return float(f"{value:.6g}") if math.isfinite(value) else None
@@ -211,10 +221,10 @@ def per_world(measures: dict[str, torch.Tensor], stood: torch.Tensor) -> dict[st
 
 
 def response_measures(t: Trajectory, onset: int, begin: int, end: int, hit: list[int]) -> dict[str, torch.Tensor]:
-    """How far the hands in `hit` went and how soon they were back, per world, (N,) each.
+    """How far the hands in `hit` went and how soon they were back, per env, (N,) each.
 
     Displacements are means over the window of the hand's offset from its reference, less that of the half second
-    before the onset; NaN for a world that fell before the window's end.
+    before the onset; NaN for an env that fell before the window's end.
     """
     before = t.hand_offset[onset - round(BEFORE_S / t.dt) : onset][:, :, hit].mean((0, 2))
     moved = t.hand_offset[begin:end][:, :, hit].mean((0, 2)) - before
@@ -232,7 +242,7 @@ def load_overshoot(t: Trajectory, onset: int, begin: int, end: int, hit: list[in
     """How far beyond its rest a load first carries the hands in `hit`, over the way to that rest, (N,).
 
     Rest is the mean displacement from `begin` to before `end`; what counts is the displacement along it. NaN for a
-    world that fell before the window's end, or whose hand rests within `LEAST_WAY_M` of where it was.
+    env that fell before the window's end, or whose hand rests within `LEAST_WAY_M` of where it was.
     """
     offset = t.hand_offset[:, :, hit].mean(2)
     moved = offset[onset:end] - offset[onset - round(BEFORE_S / t.dt) : onset].mean(0)
@@ -255,16 +265,16 @@ def recovery(error: torch.Tensor, alive: torch.Tensor, onset: int, dt: float) ->
 
 
 def falls_by_time(t: Trajectory, onset: int, end: int) -> dict[str, int]:
-    """How many worlds fell first before the step `onset`, from there to before `end`, and later."""
+    """How many envs fell first before the step `onset`, from there to before `end`, and later."""
     before, within, ever = (t.fell[:k].any(0) for k in (onset, end, len(t.fell)))
     counts = (before, within & ~before, ever & ~within)
     return dict(zip(("before_onset", "to_window_end", "later"), (int(c.sum()) for c in counts), strict=True))
 
 
 def curve(t: Trajectory, onset: int, hit: list[int]) -> dict[str, list[float]]:
-    """Mean over standing worlds of what happens over time, from up to a second before the onset.
+    """Mean over standing envs of what happens over time, from up to a second before the onset.
 
-    Displacements are relative to the last step before it; `_std` is their standard deviation over worlds.
+    Displacements are relative to the last step before it; `_std` is their standard deviation over envs.
     """
     begin = max(0, onset - round(1.0 / t.dt))
     stood = ~t.fell.any(0)

@@ -1,4 +1,4 @@
-"""How hard a blow a robot survives: fall rate against impulse, and the impulse at which half of the robots fall."""
+"""How hard a push robots survive: fall rate against impulse, and the impulse at which half of the robots fall."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 from scipy.optimize import isotonic_regression
 
 from cotap.checks import require_range
-from cotap.envs import H1Env
+from cotap.envs import HumanoidEnv
 from cotap.evaluation.disturbance import Impact
 from cotap.evaluation.metrics import summarize
 from cotap.evaluation.report import save_figure
@@ -20,7 +20,7 @@ from cotap.evaluation.rollout import Trajectory
 
 @dataclass
 class FallCurve(Impact):
-    """Blows from nothing to `impulse`, each size in as many worlds."""
+    """Fall rate against impulse, from nothing to `impulse`, and the impulse at which half of the envs fall."""
 
     force: tuple[float, float, float] = (1.0, 0.0, 0.0)
     """Direction along x, y and z of the heading frame; its length does not count."""
@@ -28,14 +28,12 @@ class FallCurve(Impact):
     """Turn the force about the vertical by a random angle."""
     duration: float = 0.1
     """How long the force lasts [s]."""
-    impulse: float = 60.0
+    impulse: float = 75.0
     """Largest impulse [N s]."""
-    levels: int = 13
-    """Number of impulses, from zero to the largest; worlds are dealt to them evenly."""
+    levels: int = 16
+    """Number of impulses, from zero to the largest; envs are dealt to them evenly."""
     window: tuple[float, float] = (0.0, 3.0)
-    """What is measured, from the onset: falls later do not count [s]."""
-    episode_seconds: float = 4.0
-    """Length of the evaluation [s]."""
+    """What is measured, from the onset [s]."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
@@ -52,21 +50,21 @@ class FallCurve(Impact):
         """(levels,) [N s]."""
         return torch.linspace(0.0, self.impulse, self.levels)
 
-    def prepare(self, env: H1Env) -> None:
-        """Give every world its blow."""
+    def prepare(self, env: HumanoidEnv) -> None:
+        """Give every env its push."""
         super().prepare(env)
         force = self.impulses()[self._level()] / (self.duration * math.hypot(*self.force))
-        env.scripted.amplitude_h = env.scripted.amplitude_h * force[:, None, None].to(env.device)
+        env.forces.scripted.amplitude_h = env.forces.scripted.amplitude_h * force[:, None, None].to(env.device)
 
     def _level(self) -> torch.Tensor:
-        """(N,) which impulse each world takes."""
+        """(N,) which impulse each env takes."""
         return torch.arange(self.num_envs) % self.levels
 
-    def measure(self, trajectory: Trajectory, env: H1Env) -> dict[str, Any]:
-        """The measured part of the evaluation's JSON; worlds that fell before the onset are left out of the curve."""
+    def measure(self, trajectory: Trajectory, env: HumanoidEnv) -> dict[str, Any]:
+        """The measured part of the evaluation's JSON; envs that fell before the onset are left out of the curve."""
         common = super().measure(trajectory, env)
         t, onset = trajectory, round(self.onset / trajectory.dt)
-        end = onset + round(self.window[1] / t.dt)
+        end = onset + round(self.fall_seconds / t.dt)
         stood, fell = ~t.fell[:onset].any(0), t.fell[onset:end].any(0)
         level = self._level()
         rates = [summarize(fell[stood & (level == k)], self.seed) for k in range(self.levels)]
@@ -75,6 +73,15 @@ class FallCurve(Impact):
             "fall_curve": {"impulse": self.impulses().tolist(), "fall_rate": rates},
             "impulse_50": half,
         }
+
+    def table(self, result: dict[str, Any]) -> str:
+        """Measures, then fall rates by impulse, as Markdown."""
+        lines = ["| impulse [N s] | fall rate | 95 % interval |", "|---|---|---|"]
+        for x, rate, low, high in curve_points(result):
+            lines.append(f"| {x:g} | {rate:.1%} | {low:.1%} to {high:.1%} |")
+        half = result["impulse_50"]
+        found = half["reason"] if half["mean"] is None else f"half fall at {half['mean']:.1f} N s"
+        return "\n".join([*lines, "", super().table(result), "", found])
 
     def plot(self, path: Path, result: dict[str, Any]) -> None:
         """Fall rate with its interval against impulse."""
@@ -85,20 +92,21 @@ class FallCurve(Impact):
 
         figure, axis = plt.subplots(figsize=(5.2, 3.8), constrained_layout=True)
         draw_fall_curve(axis, result, "#2171b5", result["method"])
-        axis.set(xlabel="impulse [N s]", ylabel="share of worlds that fell", ylim=(-0.02, 1.02))
+        axis.set(xlabel="impulse [N s]", ylabel="share of envs that fell", ylim=(-0.02, 1.02))
         axis.grid(alpha=0.2)
         axis.legend(frameon=False)
         save_figure(figure, path)
 
 
+def curve_points(result: dict[str, Any]) -> list[tuple[float, float, float, float]]:
+    """Impulse [N s], fall rate and its interval, wherever an env was left to fall."""
+    found = zip(result["fall_curve"]["impulse"], result["fall_curve"]["fall_rate"], strict=True)
+    return [(x, r["mean"], *r["ci95"]) for x, r in found if r["mean"] is not None]
+
+
 def draw_fall_curve(axis: Any, result: dict[str, Any], color: str, label: str) -> None:
     """Add one result's curve to a matplotlib axis."""
-    points = [
-        (x, r["mean"], *r["ci95"])
-        for x, r in zip(result["fall_curve"]["impulse"], result["fall_curve"]["fall_rate"], strict=True)
-        if r["mean"] is not None
-    ]
-    x, mean, low, high = zip(*points, strict=True)
+    x, mean, low, high = zip(*curve_points(result), strict=True)
     axis.plot(x, mean, "o-", color=color, ms=3, label=label)
     axis.fill_between(x, low, high, color=color, alpha=0.2, lw=0)
 
@@ -106,13 +114,13 @@ def draw_fall_curve(axis: Any, result: dict[str, Any], color: str, label: str) -
 def half_point(
     impulse: torch.Tensor, level: torch.Tensor, fell: torch.Tensor, seed: int = 0, resamples: int = 500
 ) -> dict[str, Any]:
-    """Impulse at which half of the robots fall, with a bootstrap 95 % interval over worlds.
+    """Impulse at which half of the robots fall, with a bootstrap 95 % interval over envs.
 
     The fall rate is taken to grow with the impulse (isotonic regression) and to be linear between levels.
 
     Args:
         impulse: (L,) ascending [N s].
-        level: (N,) which of them each world took.
+        level: (N,) which of them each env took.
         fell: (N,) bool.
         seed: Of the bootstrap.
         resamples: Of the bootstrap.
@@ -120,7 +128,7 @@ def half_point(
     found = _crossing(impulse, level, fell)
     if found is None:
         low = bool(fell[level == 0].float().mean() >= 0.5) if (level == 0).any() else False
-        reason = "half or more fall without a blow" if low else f"fewer than half fall at {float(impulse[-1]):g} N s"
+        reason = "half or more fall without a push" if low else f"fewer than half fall at {float(impulse[-1]):g} N s"
         return {"mean": None, "ci95": None, "reason": reason}
     rng = torch.Generator().manual_seed(seed)
     n = len(level)

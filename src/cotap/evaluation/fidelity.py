@@ -5,22 +5,21 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 
-from cotap.checks import require_one_of, require_positive_int, require_range
+from cotap.checks import require_range
 from cotap.compliance import condition_number
 from cotap.compliance.dynamics import gravity_torque
-from cotap.envs import H1Env, H1EnvConfig
-from cotap.envs.commands import STEADY_RAD
-from cotap.envs.reference import ClipConfig, load_clips
+from cotap.compliance.laws import WITHOUT_STIFFNESS
+from cotap.envs import HumanoidEnv
+from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.metrics import summarize
-from cotap.evaluation.quiet import quiet
-from cotap.evaluation.report import save_figure
-from cotap.evaluation.rollout import PolicyFunction
-from cotap.evaluation.scenario import PELVIS
-from cotap.evaluation.static import settle
+from cotap.evaluation.report import heading, save_figure
+from cotap.evaluation.rollout import PolicyFunction, acting
+from cotap.evaluation.static import HeldLoad, settle
+from cotap.motions.reference import ClipConfig, load_clips
 from cotap.robots import RobotSpec
 from cotap.robots.chains import arm_chains, arm_inertias
 
@@ -29,66 +28,59 @@ HOLDABLE = 0.9
 
 
 @dataclass
-class Fidelity:
-    """Poses of the shipped motion, every axis, several stiffnesses; a load that should move the hand by a set way."""
+class Fidelity(HeldLoad):
+    """Commanded against felt stiffness over many arm poses, axes and stiffnesses, by default while standing.
 
-    poses: int = 16
-    """Number of arm poses, drawn from the shipped motion."""
+    A load should move the hand by a set way. Every env has a pose, an axis and a stiffness of its own.
+    """
+
+    laws: ClassVar[LawOptions] = LawOptions(method="cotap")
+
+    num_envs: int = 192
+    """Number of envs, dealt to stiffnesses, axes and poses: with 4 stiffnesses 12 envs a pose."""
     stiffness_levels: tuple[float, ...] = (100.0, 200.0, 400.0, 800.0)
     """Hand stiffnesses, on all axes [N/m]; they take the place of `--stiffness`."""
     displacement: float = 0.02
     """How far the load should move the hand, at most 0.05 [m]."""
     condition: float = 8.0
     """Largest condition number of the hand's Jacobian among the poses."""
-    hand: str = "left"
-    """left or right."""
+    library: str = ""
+    """Motion library (.npz) that poses are drawn from; empty takes the one that comes with the package."""
     pelvis: str = "free"
     """free: standing, under the policy. fixed: held in the air, no policy."""
+    upper_actions: str = "policy"
+    """What moves the arms (pelvis free): policy, or reference for the raw reference instead of its upper actions."""
     settle_seconds: float = 6.0
     """How long the robot is left to settle without the load, then with it; the last second of each is measured [s]."""
-    arm_actions: bool = True
-    """Let the policy's own residual move the arms."""
-    torque_limit_scale: float = 1.0
-    """Factor on the robot's torque limits."""
-    seed: int = 0
-    """Seed of worlds and poses."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
-        require_positive_int("poses", self.poses)
+        super().check()
         if not self.stiffness_levels:
             raise ValueError("stiffness_levels must not be empty")
         for i, value in enumerate(self.stiffness_levels):
             require_range(f"stiffness_levels[{i}]", value, 1.0, 1e5)
         require_range("displacement", self.displacement, 1e-4, 0.05)
         require_range("condition", self.condition, 1.0, 1e3)
-        require_one_of("hand", self.hand, ("left", "right"))
-        require_one_of("pelvis", self.pelvis, PELVIS)
-        require_range("settle_seconds", self.settle_seconds, 2.0, 600.0)
-        require_range("torque_limit_scale", self.torque_limit_scale, 1e-3, 1e3)
 
-    @property
-    def num_envs(self) -> int:
-        """Worlds in all: poses, axes, stiffnesses."""
-        return self.poses * 3 * len(self.stiffness_levels)
+    def evaluate(self, env: HumanoidEnv, policy: PolicyFunction) -> dict[str, Any]:
+        """Run. Returns the measured part of the JSON."""
+        measured, coverage = measure(env, self, policy)
+        falls = int(measured.fell.sum())
+        return {"num_falls": falls, **summary(measured, coverage, self), "window": self.window}
 
-    def configure(self, env: H1EnvConfig) -> H1EnvConfig:
-        """Turn an environment into this protocol's. Changes and returns `env`."""
-        self.check()
-        quiet(env)
-        env.num_envs, env.seed, env.torque_limit_scale = self.num_envs, self.seed, self.torque_limit_scale
-        env.fixed_base = self.pelvis == "fixed"
-        env.motions.clips.share = 0.0
-        env.terminations.episode_s = 1e6
-        env.commands.steady_rad = STEADY_RAD
-        env.commands.stand_probability, env.commands.height_offset = 1.0, (0.0, 0.0)
-        env.force.force, env.force.hand, env.force.start_s = (1.0, 1.0, 1.0), self.hand, self.settle_seconds
-        return env
+    def table(self, result: dict[str, Any]) -> str:
+        """Errors by axis and stiffness, as Markdown."""
+        return table(result)
+
+    def plot(self, path: Path, result: dict[str, Any]) -> None:
+        """Error against commanded stiffness, axis by axis."""
+        plot(path, result)
 
 
 @dataclass(frozen=True)
 class FidelityResult:
-    """W worlds, each with a pose, an axis and a stiffness of its own."""
+    """W envs, each with a pose, an axis and a stiffness of its own."""
 
     axis: torch.Tensor
     """(W,) 0, 1 or 2."""
@@ -105,7 +97,7 @@ class FidelityResult:
 
     @property
     def counted(self) -> torch.Tensor:
-        """(W,) bool: worlds that say something about stiffness."""
+        """(W,) bool: envs that say something about stiffness."""
         return ~(self.fell | self.unholdable)
 
 
@@ -115,47 +107,39 @@ def conditions(joints: torch.Tensor, spec: RobotSpec) -> torch.Tensor:
     return condition_number(chains.jacobian(chains.pose(joints.unflatten(1, (len(spec.arms), -1)))))
 
 
-def shipped_poses(spec: RobotSpec) -> torch.Tensor:
-    """Arm joints (T, U) of all the shipped motion, at 50 Hz."""
-    clips = load_clips(ClipConfig(held_out=()), spec).clips
+def library_poses(spec: RobotSpec, library: str = "") -> torch.Tensor:
+    """Arm joints (T, U) of all motion in a library, at 50 Hz; by default of the one that comes with the package."""
+    clips = load_clips(ClipConfig(library=library, held_out=()), spec).clips
     return torch.cat([torch.as_tensor(clip.arms) for clip in clips])
 
 
-def measure(env: H1Env, protocol: Fidelity, policy: PolicyFunction | None) -> tuple[FidelityResult, float]:
-    """Run the protocol in `env`, made from its config. Returns what was measured, and the share of the shipped
-    motion's time that poses of its condition number cover."""
+def measure(env: HumanoidEnv, protocol: Fidelity, policy: PolicyFunction) -> tuple[FidelityResult, float]:
+    """Run the protocol in `env`, made from its config. Returns what was measured, and the share of the library's time
+    that poses of its condition number cover."""
+    if env.cfg.upper_body.of(protocol.hand).name in WITHOUT_STIFFNESS:
+        raise ValueError("fidelity needs a law with a stiffness at the hand, such as --method cotap")
+    frames = library_poses(env.spec, protocol.library)
     side = [arm.side for arm in env.spec.arms].index(protocol.hand)
-    frames = shipped_poses(env.spec)
     good = conditions(frames, env.spec)[:, side] <= protocol.condition
     if not good.any():
-        raise ValueError(f"condition {protocol.condition}: no pose of the shipped motion has one that low")
+        raise ValueError(f"condition {protocol.condition}: no pose of the motion library has one that low")
     rng = torch.Generator().manual_seed(protocol.seed)
-    chosen = frames[good][torch.randint(0, int(good.sum()), (protocol.poses,), generator=rng)]
-    levels = torch.tensor(protocol.stiffness_levels)
-    pose, axis, level = (
-        x.flatten()
-        for x in torch.meshgrid(torch.arange(protocol.poses), torch.arange(3), torch.arange(len(levels)), indexing="ij")
-    )
-    stiffness = levels[level]
+    levels, index = torch.tensor(protocol.stiffness_levels), torch.arange(env.num_envs)
+    stiffness, axis, number = levels[index % len(levels)], index // len(levels) % 3, index // (3 * len(levels))
+    pose = frames[good][torch.randint(0, int(good.sum()), (int(number[-1]) + 1,), generator=rng)][number]
     direction = torch.nn.functional.one_hot(axis, 3) * (2.0 * torch.randint(0, 2, (len(axis), 1), generator=rng) - 1.0)
-    force = stiffness.unsqueeze(1) * protocol.displacement * direction
-    env.upper_body.parameters.stiffness[:] = stiffness[:, None, None]
-    env.scripted.amplitude_h.zero_()
-    env.scripted.amplitude_h[:, side] = force
-    env.motions.hold(chosen[pose])
-    unholdable = _torque_share(env, chosen[pose], side, force) > HOLDABLE
-    n = env.num_envs
-    nominal = torch.full((n,), env.spec.nominal_height_m)
-    env.commands.override(torch.zeros(n, 2), torch.zeros(n), torch.ones(n), nominal)
-    settled = settle(
-        env, policy if protocol.pelvis == "free" else None, protocol.settle_seconds, side, protocol.arm_actions
-    )
+    force_h = stiffness.unsqueeze(1) * protocol.displacement * direction
+    env.upper_body.parameters.stiffness[:] = stiffness[:, None, None].to(env.device)
+    side = protocol.load(env, force_h)
+    env.motions.hold(pose)
+    unholdable = _torque_share(env, pose, side, force_h) > HOLDABLE
+    settled = settle(env, acting(env, policy, protocol.upper_actions), protocol.settle_seconds, side)
     way = (settled.moved * direction).sum(1) / protocol.displacement
     result = FidelityResult(axis, stiffness, way, settled.fell, unholdable, settled.saturated)
     return result, float(good.float().mean())
 
 
-def _torque_share(env: H1Env, pose: torch.Tensor, side: int, force: torch.Tensor) -> torch.Tensor:
+def _torque_share(env: HumanoidEnv, pose: torch.Tensor, side: int, force: torch.Tensor) -> torch.Tensor:
     """Largest share (N,) of its limit that a joint of the arm needs at `pose` (N, U) under `force` (N, 3), upright."""
     chains = arm_chains(env.spec)
     at = chains.pose(pose.unflatten(1, (len(env.spec.arms), -1)))
@@ -221,7 +205,7 @@ def _error(way: torch.Tensor, seed: int) -> dict[str, Any]:
     mean = summarize(way, seed)
     count = {"n": mean["n"], "wrong_way": int((way <= 0.0).sum())}
     if mean["mean"] is None:
-        return {"error": None, "ci95": None, **count, "reason": "no world was counted"}
+        return {"error": None, "ci95": None, **count, "reason": "no env was counted"}
     if mean["ci95"][0] <= 0.0:
         return {"error": None, "ci95": None, **count, "reason": "the hand did not go where the load is"}
     low, high = mean["ci95"]
@@ -241,12 +225,12 @@ def table(content: dict[str, Any]) -> str:
         counts = f"{row['n']} | {row['wrong_way']}"
         lines.append(f"| {row['axis']} | {row['stiffness']:g} | {error} | {interval} | {counts} |")
     notes = [
-        f"{content['num_falls']} of {content['num_envs']} worlds fell",
+        f"{content['num_falls']} of {content['num_envs']} envs fell",
         f"{content['num_wrong_way']} hands did not go where the load is",
         f"{content['num_unholdable']} loads beyond the arm's torque",
-        f"poses cover {content['coverage']:.0%} of the shipped motion's time",
+        f"poses cover {content['coverage']:.0%} of the motion library's time",
     ]
-    return "\n".join([*lines, "", f"fidelity, {content['method']}: {'; '.join(notes)}"])
+    return "\n".join([*lines, "", f"{heading(content)}: {'; '.join(notes)}"])
 
 
 def plot(path: Path, content: dict[str, Any]) -> None:

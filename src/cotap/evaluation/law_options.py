@@ -2,59 +2,66 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, fields, replace
-from typing import Any
 
 from cotap.checks import require_one_of, require_range
 from cotap.compliance.laws import LAWS, LawConfig
-from cotap.envs.upper_body import UpperBodyConfig
+from cotap.envs.upper_body import LawSampling, UpperBodyConfig
 
 
 @dataclass
 class LawOptions:
-    """Laws of the arms."""
+    """Laws of the arms. What is not given is as the policy was trained, or for another law as the law has it."""
 
-    method: str = "pd"
+    method: str | None = None
     """Upper-body law of both arms: pd, soft-pd, cotap, facet, cotap+facet, cotap+facet-matched, hmc or dcc."""
-    stiffness: tuple[float, ...] = (300.0,)
+    stiffness: tuple[float, ...] | None = None
     """Hand stiffness, one number or X Y Z, heading frame [N/m]."""
-    null_stiffness: float = 25.0
+    null_stiffness: float | None = None
     """Stiffness of arm motion that leaves the hand where it is [Nm/rad]."""
-    alpha: float = LawConfig.alpha
+    alpha: float | None = None
     """Share of compliance in its blend with PD (cotap, hmc)."""
-    error: str = LawConfig.error
+    error: str | None = None
     """What stiffness acts on: joint or task error."""
-    damping: str = LawConfig.damping
+    damping: str | None = None
     """pd or critical."""
-    virtual_mass: float = LawConfig.virtual_mass
+    virtual_mass: float | None = None
     """Mass of the hand's model [kg] (facet, hmc)."""
-    damping_ratio: float = LawConfig.damping_ratio
+    damping_ratio: float | None = None
     """Damping of the hand's model, as a share of critical (facet, hmc)."""
-    sensing: str = LawConfig.sensing
+    sensing: str | None = None
     """Force on the hand: privileged or estimated, from arm torques (facet, dcc)."""
-    reference_share: float = LawConfig.reference_share
+    reference_share: float | None = None
     """Share of the compliance that the moving reference provides (cotap+facet-matched)."""
-    torso_compliance: str = "none"
+    torso_compliance: str | None = None
     """What is put down to the torso: none, constant or support."""
     left: str = ""
     """A law for the left arm alone, such as cotap:alpha=0.7,stiffness=500."""
     right: str = ""
     """A law for the right arm alone."""
-    singularity_ratio: bool = True
-    """Go back to PD near singular arms (paper, equation 9). Without it, for the ablation that was trained so."""
+    singularity_ratio: bool | None = None
+    """Whether to go back to PD near singular arms (paper, equation 9)."""
 
-    def configure(self) -> UpperBodyConfig:
-        """The config of the arms. Raises ValueError naming what is wrong."""
-        own: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(LawConfig) if hasattr(self, f.name)}
-        own["stiffness"] = _three(self.stiffness)
-        common = LawConfig(self.method, **own)
-        out = UpperBodyConfig(
-            parse_law("left", self.left, common) if self.left else common,
-            parse_law("right", self.right, common) if self.right else replace(common),
-        )
-        out.torso.model, out.singularity_ratio = self.torso_compliance, self.singularity_ratio
+    def configure(self, trained: UpperBodyConfig | None = None) -> UpperBodyConfig:
+        """The config of the arms, for a policy that was trained with `trained`. Raises ValueError for bad options."""
+        out = copy.deepcopy(trained or UpperBodyConfig())
+        out.left, out.right = (self._law(side, out.of(side)) for side in ("left", "right"))
+        out.sampling = LawSampling()
+        if self.torso_compliance is not None:
+            out.torso.model = self.torso_compliance
+        if self.singularity_ratio is not None:
+            out.singularity_ratio = self.singularity_ratio
         out.check()
         return out
+
+    def _law(self, side: str, trained: LawConfig) -> LawConfig:
+        name, text = self.method or trained.name, getattr(self, side)
+        given = {f.name: value for f in fields(LawConfig) if (value := getattr(self, f.name, None)) is not None}
+        if self.stiffness is not None:
+            given["stiffness"] = _three(self.stiffness)
+        law = replace(trained if name == trained.name else LawConfig(name), **given)
+        return parse_law(side, text, law) if text else law
 
 
 def parse_law(option: str, text: str, common: LawConfig) -> LawConfig:

@@ -120,7 +120,7 @@ def linearize(
     push[:, joints:] = torch.linalg.inv(inertia).flatten(0, 1)
     flow = torch.zeros(poses, 2 * joints, 2 * joints, dtype=q.dtype)
     flow[:, :joints, joints:] = torch.eye(joints, dtype=q.dtype)
-    damping = answer.damping + arms.friction * torch.eye(joints, dtype=q.dtype)
+    damping = answer.damping + torch.diag_embed(arms.friction)
     springs = torch.cat((answer.stiffness + sag, damping), -1).flatten(0, 1)
     flow -= push @ springs
     return ClosedLoop(

@@ -1,4 +1,4 @@
-"""Measures, computed from recorded arrays only, per world; then mean, deviation and bootstrap interval over worlds."""
+"""Measures, computed from recorded arrays only, per env; then mean, deviation and bootstrap interval over envs."""
 
 from __future__ import annotations
 
@@ -10,9 +10,14 @@ import torch
 
 from cotap.evaluation.rollout import Trajectory
 
+HEIGHT_SETTLE_S = 1.5
+"""Time that a change of height is given before errors count: 0.2 m at the command's rate, 0.25 m/s, and some [s]."""
+STILL_SPEED = 0.1
+"""A torso slower than this stands still [m/s]."""
+
 
 def masked_mean(values: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
-    """Mean over time (dim 0) of `values` (T, N) where `mask` (T, N); NaN for a world with no such step, (N,)."""
+    """Mean over time (dim 0) of `values` (T, N) where `mask` (T, N); NaN for an env with no such step, (N,)."""
     count = mask.sum(0)
     total = torch.where(mask, values, torch.zeros_like(values)).sum(0)
     return torch.where(count > 0, total / count.clamp_min(1), torch.full_like(total, math.nan))
@@ -52,7 +57,7 @@ def slope(commanded: torch.Tensor, measured: torch.Tensor, mask: torch.Tensor) -
 def swing_heights(foot_height: torch.Tensor, contact: torch.Tensor, mask: torch.Tensor, min_steps: int) -> torch.Tensor:
     """Mean peak height (N,) of the feet over swings of at least `min_steps` that end inside `mask` (T, N) [m].
 
-    A swing is a stretch without contact; shorter stretches than `min_steps` are chatter. NaN for a world with none.
+    A swing is a stretch without contact; shorter stretches than `min_steps` are chatter. NaN for an env with none.
     """
     peak = torch.zeros(foot_height.shape[1:])
     length = torch.zeros(foot_height.shape[1:])
@@ -67,37 +72,39 @@ def swing_heights(foot_height: torch.Tensor, contact: torch.Tensor, mask: torch.
 
 
 def tracking_measures(t: Trajectory, gait_period_s: float, settle_s: float = 1.0) -> dict[str, torch.Tensor]:
-    """Velocity-tracking measures per world, (N,) each; NaN where a world has nothing to measure.
+    """Velocity-tracking measures per env, (N,) each; NaN where an env has nothing to measure.
 
-    Errors are taken once a command has held for `settle_s`; `_gait` errors use velocities averaged over the last gait
-    period, all of it after the command's change. A command is of velocity and standing: a height that changes while
-    both hold, as from one stance to another, moves at `commands.height_rate` within what is measured, and how far the
-    torso lags behind it is in `e_height`.
+    Errors are against what was asked, once that has held for `settle_s`, a height for `HEIGHT_SETTLE_S`. `_gait` errors
+    use velocities averaged over a gait period, all of it settled, and so do `stand_drift`, the speed while asked to
+    stand, and `still_share`, the share of that time that is slower than `STILL_SPEED` with all feet down.
     """
     period = round(gait_period_s / t.dt)
     ok = settled(t, settle_s)
-    ok_gait = settled(t, max(settle_s, gait_period_s))
+    ok_gait = settled(t, settle_s + gait_period_s)
     error = t.velocity - t.command
-    error_gait = moving_average(t.velocity, period) - t.command
     walking = ~t.stand
     contact = t.foot_contact & ok.unsqueeze(2)
     slip = torch.where(contact, t.foot_speed, torch.zeros_like(t.foot_speed)).sum((0, 2)) / contact.sum(
         (0, 2)
     ).clamp_min(1)
-    told = steps_since_change(t.told_to_stand.unsqueeze(2)) >= round((settle_s + gait_period_s) / t.dt)
-    told = told & t.told_to_stand & t.alive()
-    drift = moving_average(t.velocity, period)[..., :2].norm(dim=2)
+    average = moving_average(t.velocity, period)
+    error_gait = average - t.command
+    ok_height = (steps_since_change(t.height_command.unsqueeze(2)) >= round(HEIGHT_SETTLE_S / t.dt)) & t.alive()
+    ok_stand = steps_since_change(t.stand.unsqueeze(2)) >= round((settle_s + gait_period_s) / t.dt)
+    ok_stand = ok_stand & t.stand & t.alive()
+    drift = average[..., :2].norm(dim=2)
+    still = (drift < STILL_SPEED) & t.foot_contact.all(2)
     return {
         "e_lin": masked_mean(error[..., :2].norm(dim=2), ok),
         "e_lin_gait": masked_mean(error_gait[..., :2].norm(dim=2), ok_gait),
         "e_yaw": masked_mean(error[..., 2].abs(), ok),
         "e_yaw_gait": masked_mean(error_gait[..., 2].abs(), ok_gait),
-        "e_height": masked_mean((t.height - t.height_command).abs(), ok),
+        "e_height": masked_mean((t.height - t.height_command).abs(), ok_height),
         "e_upper": masked_mean(t.arm_error.norm(dim=2), t.alive()),
         "e_ee": masked_mean(t.hand_error.mean(2), t.alive()),
         "j_upper": masked_mean(t.arm_torque.norm(dim=2), t.alive()),
-        "stand_drift": masked_mean(drift, told),
-        "stand_share": masked_mean(t.stand.float(), told),
+        "stand_drift": masked_mean(drift, ok_stand),
+        "still_share": masked_mean(still.float(), ok_stand),
         "foot_slip": torch.where(contact.any(2).any(0), slip, torch.full_like(slip, math.nan)),
         "swing_height": swing_heights(t.foot_height, t.foot_contact, ok & walking, round(0.1 / t.dt)),
         "e_path": masked_mean(t.path_error, t.alive() & torch.isfinite(t.path_error)),
@@ -107,22 +114,22 @@ def tracking_measures(t: Trajectory, gait_period_s: float, settle_s: float = 1.0
 
 
 def tracking_slopes(t: Trajectory, gait_period_s: float, settle_s: float = 1.0) -> dict[str, float]:
-    """Slopes of measured (gait-averaged) against commanded velocity while walking, over all worlds."""
+    """Slopes of measured (gait-averaged) against commanded velocity while walking, over all envs."""
     measured = moving_average(t.velocity, round(gait_period_s / t.dt))
-    ok = settled(t, max(settle_s, gait_period_s)) & ~t.stand
+    ok = settled(t, settle_s + gait_period_s) & ~t.stand
     return {f"slope_{name}": slope(t.command[..., i], measured[..., i], ok) for i, name in enumerate(("x", "y", "yaw"))}
 
 
 def summarize(values: torch.Tensor, seed: int = 0, resamples: int = 1000) -> dict[str, Any]:
-    """Mean, standard deviation and 95 % interval of the mean over worlds, and the number of worlds `n` behind them.
+    """Mean, standard deviation and 95 % interval of the mean over envs, and the number of envs `n` behind them.
 
-    Numbers (N,) get a bootstrap interval, NaN worlds left out. Events (N,) bool get Wilson's, which has a width even
-    where all worlds agree. Where nothing could be measured the numbers are null and `reason` says so.
+    Numbers (N,) get a bootstrap interval, NaN envs left out. Events (N,) bool get Wilson's, which has a width even
+    where all envs agree. Where nothing could be measured the numbers are null and `reason` says so.
     """
     counted = values[torch.isfinite(values)].double()
     n = counted.numel()
     if n == 0:
-        return {"mean": None, "std": None, "ci95": None, "n": 0, "reason": "no world had anything to measure"}
+        return {"mean": None, "std": None, "ci95": None, "n": 0, "reason": "no env had anything to measure"}
     mean, std = float(counted.mean()), float(counted.std()) if n > 1 else 0.0
     if values.dtype == torch.bool:
         return {"mean": mean, "std": std, "ci95": list(wilson_interval(mean, n)), "n": n}
@@ -133,7 +140,7 @@ def summarize(values: torch.Tensor, seed: int = 0, resamples: int = 1000) -> dic
 
 
 def summaries(measures: dict[str, torch.Tensor], keep: torch.Tensor, seed: int) -> dict[str, dict[str, Any]]:
-    """Every measure (N,) summed up over the worlds in `keep` (N,)."""
+    """Every measure (N,) summed up over the envs in `keep` (N,)."""
     return {name: summarize(values[keep], seed) for name, values in measures.items()}
 
 
@@ -148,7 +155,7 @@ def wilson_interval(share: float, n: int) -> tuple[float, float]:
 
 @lru_cache(maxsize=4)
 def _resamples(n: int, seed: int, resamples: int) -> torch.Tensor:
-    """How often each of `n` worlds is drawn in each bootstrap sample, (resamples, n)."""
+    """How often each of `n` envs is drawn in each bootstrap sample, (resamples, n)."""
     rng = torch.Generator().manual_seed(seed)
     draws = (torch.randint(0, n, (n,), generator=rng) for _ in range(resamples))
     return torch.stack([torch.bincount(draw, minlength=n) for draw in draws]).float()

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 
 from cotap.checks import require_interval, require_one_of, require_range
 from cotap.compliance.laws import WITHOUT_STIFFNESS
-from cotap.envs import H1Env
+from cotap.envs import HumanoidEnv
 from cotap.evaluation.disturbance import ConstantLoad, window_measures
+from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.metrics import summaries
 from cotap.evaluation.rollout import Trajectory
 
@@ -20,10 +21,13 @@ CHANGES = ("step", "ramp", "both")
 
 @dataclass
 class Modulation(ConstantLoad):
-    """Both ends of the range of stiffness and alpha, over and over, each world and arm in its own time."""
+    """Stiffness and alpha stepped and ramped over their whole range, each env and arm in its own time: falls, torque,
+    energy."""
+
+    laws: ClassVar[LawOptions] = LawOptions(method="cotap")
 
     change: str = "both"
-    """step: from one end to the other at once. ramp: there and back evenly. both: every other world each."""
+    """step: from one end to the other at once. ramp: there and back evenly. both: every other env each."""
     stiffness_range: tuple[float, float] = (80.0, 1200.0)
     """Hand stiffness on all axes, ramped evenly in its logarithm [N/m]."""
     alpha_range: tuple[float, float] = (0.0, 1.0)
@@ -34,6 +38,8 @@ class Modulation(ConstantLoad):
     """A load that is held, along x, y and z of the heading frame [N]; zero for none."""
     window: tuple[float, float] = (0.0, 9.0)
     """What is measured, from the onset [s]."""
+    fall_seconds: float = 9.0
+    """Falls count up to this long after the onset [s]."""
     episode_seconds: float = 10.0
     """Length of the evaluation [s]."""
 
@@ -49,8 +55,8 @@ class Modulation(ConstantLoad):
             require_range(f"alpha_range[{i}]", value, 0.0, 1.0)
         require_range("period", self.period, 0.04, 3600.0)
 
-    def prepare(self, env: H1Env) -> None:
-        """Draw where in the cycle every world and arm begins."""
+    def prepare(self, env: HumanoidEnv) -> None:
+        """Draw where in the cycle every env and arm begins."""
         super().prepare(env)
         laws = [env.cfg.upper_body.of(arm.side).name for arm in env.spec.arms]
         if all(law in WITHOUT_STIFFNESS for law in laws):
@@ -58,7 +64,7 @@ class Modulation(ConstantLoad):
         rng = torch.Generator().manual_seed(self.seed)
         self.phase = torch.rand(env.num_envs, len(env.spec.arms), 2, generator=rng).to(env.device)
 
-    def before_step(self, env: H1Env, step: int) -> None:
+    def before_step(self, env: HumanoidEnv, step: int) -> None:
         """Set stiffness and alpha of this step."""
         pace = torch.tensor([1.0, 2.0 / (1.0 + math.sqrt(5.0))], device=env.device)
         cycles = step * env.dt / self.period * pace + self.phase
@@ -71,7 +77,7 @@ class Modulation(ConstantLoad):
         p.stiffness[:] = (low + (high - low) * stiffness).exp().unsqueeze(2)
         p.alpha[:] = self.alpha_range[0] + (self.alpha_range[1] - self.alpha_range[0]) * alpha
 
-    def measure(self, trajectory: Trajectory, env: H1Env) -> dict[str, Any]:
+    def measure(self, trajectory: Trajectory, env: HumanoidEnv) -> dict[str, Any]:
         """The measured part of the evaluation's JSON; with both kinds of change, also of each by itself."""
         result = super().measure(trajectory, env) | {
             "effective_stiffness": {"commanded": None, "measured": None, "reason": "stiffness changes all the time"}

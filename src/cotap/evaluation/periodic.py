@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 
 from cotap.checks import require_finite, require_range
-from cotap.envs import H1Env, H1EnvConfig
-from cotap.envs.forces import ForceProfile
+from cotap.envs import HumanoidEnv, HumanoidEnvConfig
+from cotap.envs.scripted_forces import ForceProfile
 from cotap.evaluation.disturbance import falls_by_time, window_measures
+from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.metrics import summaries
 from cotap.evaluation.report import save_figure
 from cotap.evaluation.rollout import Trajectory
@@ -22,7 +23,12 @@ from cotap.robots import RobotSpec
 
 @dataclass
 class PeriodicLoad(Scenario):
-    """A sinusoidal load on both hands: 30 N up and down in 4 s."""
+    """A load on both hands that swings, 30 N up and down in 4 s: torques of each arm beside what statics asks for.
+
+    By default the left arm is compliant and the right one under PD; `--left "" --right ""` gives both `--method`.
+    """
+
+    laws: ClassVar[LawOptions] = LawOptions(left="cotap:alpha=0.7,stiffness=500", right="pd")
 
     force: tuple[float, float, float] = (0.0, 0.0, 30.0)
     """Amplitude along x, y and z of the heading frame [N]."""
@@ -49,14 +55,14 @@ class PeriodicLoad(Scenario):
         """Length of the evaluation [s]."""
         return self.onset + self.periods * self.period
 
-    def configure(self, env: H1EnvConfig) -> H1EnvConfig:
-        """Turn the environment that a policy was trained in into this protocol's. Changes and returns `env`."""
-        super().configure(env)
-        env.force = ForceProfile(self.force, self.hand, self.onset, self.seconds, self.period)
-        return env
+    def configure(self, env_cfg: HumanoidEnvConfig) -> HumanoidEnvConfig:
+        """Turn the environment that a policy was trained in into this protocol's. Changes and returns `env_cfg`."""
+        super().configure(env_cfg)
+        env_cfg.forces.scripted = ForceProfile(self.force, self.hand, self.onset, self.seconds, self.period)
+        return env_cfg
 
-    def measure(self, trajectory: Trajectory, env: H1Env) -> dict[str, Any]:
-        """The measured part of the evaluation's JSON."""
+    def measure(self, trajectory: Trajectory, env: HumanoidEnv) -> dict[str, Any]:
+        """The measured part of the evaluation's JSON, the number of falls aside."""
         t = trajectory
         begin, end = (round(s / t.dt) for s in (self.onset + self.period, self.seconds))
         elbows, sides = elbow_joints(env.spec), [arm.side for arm in env.spec.arms]
@@ -105,10 +111,10 @@ def elbow_joints(spec: RobotSpec) -> list[int]:
 def swing_measures(
     t: Trajectory, begin: int, end: int, period_s: float, elbows: list[int], sides: list[str]
 ) -> dict[str, torch.Tensor]:
-    """How far elbow torques and hands swing from step `begin` to before `end`, whole periods; per world, (N,) each.
+    """How far elbow torques and hands swing from step `begin` to before `end`, whole periods; per env, (N,) each.
 
     Amplitudes are those of the load's frequency (least squares); `rms` and `peak` are of everything. `_static_` is the
-    same of `arm_static_torque`: gravity and the load, whatever the law. NaN for worlds that fall before the end.
+    same of `arm_static_torque`: gravity and the load, whatever the law. NaN for envs that fall before the end.
     """
     upright = t.alive()[end - 1]
     arms = t.arm_torque.shape[2] // len(sides)
@@ -140,7 +146,7 @@ def amplitude(values: torch.Tensor, period_s: float, dt: float) -> torch.Tensor:
 
 
 def swing_curve(t: Trajectory, onset: int, elbows: list[int], sides: list[str]) -> dict[str, list[float]]:
-    """Means over the worlds that stood, over time from the onset."""
+    """Means over the envs that stood, over time from the onset."""
     stood = ~t.fell.any(0)
     if not stood.any():
         return {"time": []}

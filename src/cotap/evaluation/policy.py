@@ -14,10 +14,10 @@ from cotap.agents.actors import AgentLayout, DualActorCritic
 from cotap.agents.checkpoint import MALFORMED, CheckpointError, load_checkpoint, require_parts
 from cotap.checks import require_one_of, require_positive_int
 from cotap.configs import from_plain
-from cotap.envs import H1EnvConfig
+from cotap.envs import HumanoidEnvConfig
 
-CHECKPOINTS = ("base", "cotap", "facet", "cotap-no-ratio", "cotap-torque-critic", "cotap-goals")
-"""Names under which checkpoints are shipped: both stages, the second under FACET's law, and its ablations."""
+CHECKPOINTS = ("h1-base", "h1-cotap")
+"""Names under which policies are shipped: robot and stage."""
 
 
 def checkpoint_path(name: str) -> Path:
@@ -31,7 +31,7 @@ def shipped_names() -> list[str]:
     return [name for name in CHECKPOINTS if checkpoint_path(name).is_file()]
 
 
-def shipped_checkpoint(name: str = "base") -> Path:
+def shipped_checkpoint(name: str = "h1-base") -> Path:
     """Path of a checkpoint that comes with the package. Raises ValueError for one that does not."""
     path = checkpoint_path(name)
     if not path.is_file():
@@ -46,7 +46,7 @@ def find_checkpoint(given: str) -> Path:
 
 def default_checkpoint() -> Path:
     """What compliance is evaluated with: the distilled policy if it is shipped, else the base."""
-    return shipped_checkpoint("cotap" if "cotap" in shipped_names() else "base")
+    return shipped_checkpoint("h1-cotap" if "h1-cotap" in shipped_names() else "h1-base")
 
 
 @dataclass(frozen=True)
@@ -56,10 +56,10 @@ class Policy:
     model: DualActorCritic
     layout: dict[str, Any]
     stage: str
-    _env_config: H1EnvConfig
+    _env_config: HumanoidEnvConfig
 
     @property
-    def env_config(self) -> H1EnvConfig:
+    def env_config(self) -> HumanoidEnvConfig:
         """The environment that it was trained in, simulated by whatever there is here; a copy, free to be changed."""
         return copy.deepcopy(self._env_config)
 
@@ -109,9 +109,9 @@ def _require_fitting(networks: AgentLayout, layout: dict[str, Any]) -> None:
         )
 
 
-def _env_config_of(path: Path | str, content: dict[str, Any]) -> H1EnvConfig:
+def _env_config_of(path: Path | str, content: dict[str, Any]) -> HumanoidEnvConfig:
     try:
-        cfg = from_plain(H1EnvConfig, content["config"]["training"]["env"])
+        cfg = from_plain(HumanoidEnvConfig, content["config"]["training"]["env"])
         cfg.backend = "auto"  # the one it was trained on may not be installed here
         cfg.check()
     except KeyError as error:

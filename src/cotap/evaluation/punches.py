@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from cotap.checks import require_positive_int, require_range
-from cotap.envs import H1Env, H1EnvConfig
+from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.punches import PunchConfig
 from cotap.evaluation.course import Course, steer
 from cotap.evaluation.disturbance import window_measures
@@ -22,18 +22,18 @@ from cotap.evaluation.scenario import Scenario
 
 @dataclass
 class PunchWalk(Scenario):
-    """Waypoints, one after the other; in every segment of time one blow on a random arm joint."""
+    """A walk over waypoints while the arms take punches, one in every segment of time: who arrives."""
 
     mode: str = "walking"
     """walking; what a robot does that is to get anywhere."""
     speed: float = 0.7
     """Forward command towards a waypoint that lies ahead [m/s]."""
     force: float = 600.0
-    """Largest blow [N]; blows are uniform between 0 and this, in random directions."""
+    """Largest push [N]; pushes are uniform between 0 and this, in random directions."""
     duration: float = 0.08
-    """How long a blow lasts [s]."""
+    """How long a push lasts [s]."""
     waypoints: int = 12
-    """How many; there are as many blows."""
+    """How many; there are as many pushes."""
     leg: float = 1.5
     """Distance from one waypoint to the next [m]."""
     turn: float = 1.0
@@ -63,19 +63,19 @@ class PunchWalk(Scenario):
         """Length of the evaluation [s]."""
         return self.episode_seconds
 
-    def configure(self, env: H1EnvConfig) -> H1EnvConfig:
-        """Turn the environment that a policy was trained in into this protocol's. Changes and returns `env`."""
-        super().configure(env)
-        env.punches = self._punches()
-        return env
+    def configure(self, env_cfg: HumanoidEnvConfig) -> HumanoidEnvConfig:
+        """Turn the environment that a policy was trained in into this protocol's. Changes and returns `env_cfg`."""
+        super().configure(env_cfg)
+        env_cfg.forces.punches = self._punches()
+        return env_cfg
 
-    def prepare(self, env: H1Env) -> None:
+    def prepare(self, env: HumanoidEnv) -> None:
         """Lay out the waypoints."""
         super().prepare(env)
         rng = torch.Generator().manual_seed(self.seed)
         self.course = Course(self.waypoints, self.leg, self.turn, self.radius, env.num_envs, rng, env.device)
 
-    def before_step(self, env: H1Env, step: int) -> None:
+    def before_step(self, env: HumanoidEnv, step: int) -> None:
         """Steer towards the next waypoint."""
         s = env.state
         if step == 0:
@@ -89,8 +89,8 @@ class PunchWalk(Scenario):
         stand, height = done.float(), torch.full((n,), env.spec.nominal_height_m, device=env.device)
         env.commands.override(velocity * ~done.unsqueeze(1), yaw_rate * ~done, stand, height)
 
-    def measure(self, trajectory: Trajectory, env: H1Env) -> dict[str, Any]:
-        """The measured part of the evaluation's JSON."""
+    def measure(self, trajectory: Trajectory, env: HumanoidEnv) -> dict[str, Any]:
+        """The measured part of the evaluation's JSON, the number of falls aside."""
         t = trajectory
         fell = t.fell.any(0)
         reached = self.course.reached.cpu()
@@ -113,7 +113,7 @@ class PunchWalk(Scenario):
         }
 
     def plot(self, path: Path, result: dict[str, Any]) -> None:
-        """Share of worlds that are still upright, over time."""
+        """Share of envs that are still upright, over time."""
         import matplotlib
 
         matplotlib.use("Agg")
@@ -121,6 +121,6 @@ class PunchWalk(Scenario):
 
         figure, axis = plt.subplots(figsize=(5.2, 3.6), constrained_layout=True)
         axis.plot(result["curve"]["time"], result["curve"]["upright"], color="#2171b5")
-        axis.set(xlabel="time [s]", ylabel="share of worlds upright", ylim=(0.0, 1.02))
+        axis.set(xlabel="time [s]", ylabel="share of envs upright", ylim=(0.0, 1.02))
         axis.grid(alpha=0.2)
         save_figure(figure, path)

@@ -19,20 +19,20 @@ from cotap.evaluation.metrics import summarize, tracking_measures
 from cotap.evaluation.rollout import STEPPED, Trajectory
 from cotap.files import write_arrays
 
-FORMAT, VERSION = "cotap-recording", 1
+FORMAT, VERSION = "cotap-recording", 2
 SCENE: dict[str, tuple[str | int, ...]] = {
     "qpos": ("Q",), "hand_w": ("H", 3), "hand_reference_w": ("H", 3), "hand_force_w": ("H", 3), "heading_w": (3, 3),
     "commanded_stiffness": ("H", 3), "effective_stiffness": ("H", 3, 3), "stiffness_eigenvalues": ("H", 2),
 }  # fmt: skip
 """What is shown beside the trajectory, and its sizes after (T, N); those that a letter stands for are all alike."""
 TRAJECTORY: dict[str, tuple[str | int, ...]] = {
-    "velocity": (3,), "command": (3,), "stand": (), "told_to_stand": (), "height": (), "height_command": (),
+    "velocity": (3,), "command": (3,), "stand": (), "height": (), "height_command": (),
     "position": (2,), "arm_error": ("U",), "arm_velocity": ("U",), "arm_torque": ("U",), "arm_at_limit": (),
     "arm_static_torque": ("U",), "hand_offset": ("H", 3), "hand_error": ("H",), "foot_contact": ("F",),
     "foot_speed": ("F",), "foot_height": ("F",), "path_error": (), "fell": (),
 }  # fmt: skip
 """The same of the trajectory."""
-EVENTS = ("stand", "told_to_stand", "arm_at_limit", "foot_contact", "fell")
+EVENTS = ("stand", "arm_at_limit", "foot_contact", "fell")
 """Of these, what is true or false; all else is in single precision."""
 _LARGEST = 1e12
 """Whatever is larger was measured on no robot, and its square soon is no number."""

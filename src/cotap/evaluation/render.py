@@ -14,10 +14,9 @@ import torch
 
 from cotap.agents.actors import as_dict
 from cotap.checks import reason_of
-from cotap.envs import H1Env, H1EnvConfig
-from cotap.envs.commands import STEADY_RAD
-from cotap.evaluation.quiet import quiet
+from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.evaluation.rollout import PolicyFunction
+from cotap.evaluation.undisturbed import disable_disturbances
 from cotap.files import write_atomically
 from cotap.robots import RobotSpec
 from cotap.robots.mjcf import build_model
@@ -78,7 +77,7 @@ LONGEST_ARROW_M = 0.8
 
 
 def film_frames(
-    env: H1Env, film: torch.Tensor, width: int = 640, height: int = 480, camera: str = "track"
+    env: HumanoidEnv, film: torch.Tensor, width: int = 640, height: int = 480, camera: str = "track"
 ) -> Iterator[np.ndarray]:
     """Images (height, width, 3) uint8 of a film (T, nq + 6 H) of `record_rollout`.
 
@@ -120,7 +119,7 @@ def _add_arrow(scene: mujoco.MjvScene, tip: np.ndarray, force: np.ndarray) -> No
     mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_ARROW, 0.02, tail, tip)
 
 
-def film_video(path: Path, env: H1Env, film: torch.Tensor, sheet: Path | None = None) -> None:
+def film_video(path: Path, env: HumanoidEnv, film: torch.Tensor, sheet: Path | None = None) -> None:
     """Write a video (and a contact sheet) of a film.
 
     Raises:
@@ -155,12 +154,12 @@ def contact_sheet(path: Path, frames: list[np.ndarray], columns: int) -> None:
     write_atomically(path, lambda p: imageio.imwrite(p, np.concatenate(rows, 0), format="png"))  # pyright: ignore
 
 
-def record_tour(cfg: H1EnvConfig, policy: PolicyFunction, seed: int = 0) -> tuple[H1Env, torch.Tensor]:
+def record_tour(cfg: HumanoidEnvConfig, policy: PolicyFunction, seed: int = 0) -> tuple[HumanoidEnv, torch.Tensor]:
     """One nominal robot on the tour. Returns the environment and its `qpos` (T, nq) at every control step."""
-    quiet(cfg)
+    disable_disturbances(cfg)
     cfg.num_envs, cfg.seed, cfg.backend = 1, seed, "mjbatch"
-    cfg.terminations.episode_s, cfg.commands.steady_rad = 1e4, STEADY_RAD
-    env = H1Env(cfg)
+    cfg.terminations.episode_s = 1e4
+    env = HumanoidEnv(cfg)
     rows: list[torch.Tensor] = []
     nominal = env.spec.nominal_height_m
     obs = env.get_observations()
@@ -174,7 +173,7 @@ def record_tour(cfg: H1EnvConfig, policy: PolicyFunction, seed: int = 0) -> tupl
     return env, torch.stack(rows)
 
 
-def tour_video(path: Path, cfg: H1EnvConfig, policy: PolicyFunction, sheet: Path | None = None) -> None:
+def tour_video(path: Path, cfg: HumanoidEnvConfig, policy: PolicyFunction, sheet: Path | None = None) -> None:
     """Write a video (and a contact sheet) of the tour.
 
     Raises:

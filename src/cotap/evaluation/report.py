@@ -9,7 +9,7 @@ import torch
 
 from cotap.evaluation.metrics import moving_average, settled
 from cotap.evaluation.rollout import Trajectory
-from cotap.files import write_atomically
+from cotap.files import require_output, write_atomically
 
 UNITS = {
     "e_lin": "m/s", "e_lin_gait": "m/s", "e_yaw": "rad/s", "e_yaw_gait": "rad/s", "e_height": "m", "e_upper": "rad",
@@ -19,6 +19,25 @@ UNITS = {
     "displacement_x": "m", "displacement_y": "m", "displacement_z": "m",
     "seconds_upright": "s", "j_upper_blow": "Nm",
 }  # fmt: skip
+
+
+def require_outputs(json: str, plot: str, video: str) -> None:
+    """Fail before the work rather than after it: ValueError where results cannot be written, or replace each other."""
+    require_output("--json", json)
+    require_output("--plot", plot, (".png",))
+    require_output("--video", video, (".mp4",))
+    sheet = str(sheet_path(video)) if video else ""
+    wanted = {"--json": json, "--plot": plot, "--video": video, "the contact sheet of --video": sheet}
+    named: dict[Path, str] = {}
+    for option, path in wanted.items():
+        if path and (other := named.setdefault(Path(path).resolve(), option)) != option:
+            raise ValueError(f"{option} and {other} are one file, {path!r}")
+
+
+def sheet_path(video: str) -> Path:
+    """Where a video's contact sheet goes."""
+    path = Path(video)
+    return path.with_name(f"{path.stem}_frames.png")
 
 
 def save_figure(figure: Any, path: Path) -> None:
@@ -40,8 +59,13 @@ def table(result: dict[str, Any]) -> str:
         lines.append(f"| {name} | {m['mean']:.4f} | {m['std']:.4f} | {low:.4f} to {high:.4f} | {UNITS.get(name, '')} |")
     for name, value in result.get("slopes", {}).items():
         lines.append(f"| {name} | {'-' if value is None else f'{value:.3f}'} | | | |")
-    falls = f"{result['num_falls']} of {result['num_envs']} worlds fell"
-    return "\n".join([*lines, "", f"{result['protocol']}, {result['method']}: {falls}, {result['seconds']:.1f} s"])
+    falls = f"{result['num_falls']} of {result['num_envs']} envs fell"
+    return "\n".join([*lines, "", f"{heading(result)}: {falls}, {result['seconds']:.1f} s"])
+
+
+def heading(result: dict[str, Any]) -> str:
+    """What was evaluated, in words."""
+    return f"{result['protocol']}, {result['method']}, arms {result['arms']}"
 
 
 def plot_tracking(path: Path, t: Trajectory, gait_period_s: float, settle_s: float) -> None:
@@ -52,7 +76,7 @@ def plot_tracking(path: Path, t: Trajectory, gait_period_s: float, settle_s: flo
     import matplotlib.pyplot as plt
 
     measured = moving_average(t.velocity, round(gait_period_s / t.dt))
-    ok = settled(t, max(settle_s, gait_period_s))
+    ok = settled(t, settle_s + gait_period_s)
     walking, standing = ok & ~t.stand, ok & t.stand
     figure, axes = plt.subplots(1, 4, figsize=(15, 3.9), constrained_layout=True)
     panels = [

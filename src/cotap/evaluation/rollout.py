@@ -1,4 +1,4 @@
-"""Running a policy in many worlds and recording what happens."""
+"""Running a policy in many envs and recording what happens."""
 
 from __future__ import annotations
 
@@ -12,30 +12,29 @@ from tqdm import tqdm
 from cotap.agents.actors import as_dict
 from cotap.compliance.dynamics import gravity_torque
 from cotap.compliance.interface import Arms
-from cotap.envs import H1Env
+from cotap.envs import HumanoidEnv
 from cotap.envs.state import RobotState
 from cotap.rotations import rotate_inverse
 
 PolicyFunction = Callable[[dict[str, torch.Tensor]], torch.Tensor]
+UPPER_ACTIONS = ("policy", "reference")
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Recorded tensors, T steps of N worlds; a world's record is meaningful up to its fall, that step included."""
+    """Recorded tensors, T steps of N envs; an env's record is meaningful up to its fall."""
 
     dt: float
     velocity: torch.Tensor
     """(T, N, 3) torso velocity x, y in the heading frame [m/s] and yaw rate [rad/s]."""
     command: torch.Tensor
-    """(T, N, 3) what they were asked to be."""
+    """(T, N, 3) what they were asked to be, rates of change aside."""
     stand: torch.Tensor
-    """(T, N) bool: standing, not stepping."""
-    told_to_stand: torch.Tensor
-    """(T, N) bool: to stand is what was asked, whether or not it steps at first or for its balance."""
+    """(T, N) bool: to stand is what was asked, whether or not the robot still slows down."""
     height: torch.Tensor
     """(T, N) [m]."""
     height_command: torch.Tensor
-    """(T, N) [m]."""
+    """(T, N) what it was asked to be, its rate of change aside [m]."""
     position: torch.Tensor
     """(T, N, 2) horizontal position of the torso in the world [m]."""
     arm_error: torch.Tensor
@@ -59,36 +58,34 @@ class Trajectory:
     foot_height: torch.Tensor
     """(T, N, F) of the soles' centres [m]."""
     path_error: torch.Tensor
-    """(T, N) horizontal distance of the torso from where its path has it [m]; NaN in worlds that follow none."""
+    """(T, N) horizontal distance of the torso from where its path has it [m]; NaN in envs that follow none."""
     fell: torch.Tensor
-    """(T, N) bool: the world fell in that step."""
+    """(T, N) bool: the env fell in that step."""
     film: torch.Tensor = field(default_factory=lambda: torch.zeros(0, 0))
-    """(F, nq + 6 H) the first world's configuration, its hands' references and the force on each hand, world frame;
-    F = T if it was filmed, else 0."""
+    """(F, nq + 6 H) the first env's configuration, its hands' references and the force on each hand, world frame;
+    F = T for rollouts in simulation, else 0."""
 
     def alive(self) -> torch.Tensor:
-        """(T, N) bool: the world has not fallen up to and including this step."""
+        """(T, N) bool: the env has not fallen up to and including this step."""
         return self.fell.cumsum(0) == 0
 
 
 STEPPED = tuple(f.name for f in fields(Trajectory) if f.name not in ("dt", "film"))
-"""What a trajectory has of every step and world."""
+"""What a trajectory has of every step and env."""
 
 
 def record_rollout(
-    env: H1Env, policy: PolicyFunction, steps: int, progress: bool = True, arm_actions: bool = True,
-    before_step: Callable[[H1Env, int], None] | None = None, film: bool = False,
+    env: HumanoidEnv, policy: PolicyFunction, steps: int, progress: bool = True,
+    before_step: Callable[[HumanoidEnv, int], None] | None = None,
 ) -> Trajectory:  # fmt: skip
-    """Run `policy` for `steps` control steps from a fresh start of every world.
+    """Run `policy` for `steps` control steps from a fresh start of every env.
 
     Args:
-        env: The worlds.
-        policy: Actions of observations, on the worlds' device; what is recorded is on the processor.
+        env: The envs.
+        policy: Actions of observations, on the envs' device; what is recorded is on the processor.
         steps: Number of control steps.
         progress: Whether to show a progress bar.
-        arm_actions: With False, what the policy does with the arms is left out.
         before_step: Called before every step with the environment and the step's number: commands, parameters of laws.
-        film: Whether to record what pictures of the first world need.
     """
     obs = env.reset()
     record: dict[str, torch.Tensor] = {}
@@ -96,29 +93,47 @@ def record_rollout(
     for step in tqdm(range(steps), desc="rollout", unit="step", disable=None if progress else True, leave=False):
         if before_step:
             before_step(env, step)
-        action = policy(as_dict(obs, env.device))
-        if not arm_actions:
-            action = action.clone()
-            action[:, env.action_slices["upper"]] = 0.0
-        obs, _, _, extras = env.step(action)
+        obs, _, _, extras = env.step(policy(as_dict(obs, env.device)))
         for name, value in trajectory_row(env, extras["falls"]).items():
             record.setdefault(name, value.new_empty((steps, *value.shape)))[step] = value
-        if film:
-            frames.append(_frame(env))
-    seen = torch.stack(frames).cpu() if frames else torch.zeros(0, 0)
-    return Trajectory(dt=env.dt, film=seen, **{name: value.cpu() for name, value in record.items()})
+        frames.append(_frame(env))
+    return Trajectory(
+        dt=env.dt, film=torch.stack(frames).cpu(), **{name: value.cpu() for name, value in record.items()}
+    )
 
 
-def _frame(env: H1Env) -> torch.Tensor:
-    """What a picture of the first world needs: (nq + 6 H,)."""
+def _frame(env: HumanoidEnv) -> torch.Tensor:
+    """What a picture of the first env needs: (nq + 6 H,)."""
     s, hands = env.record.state, len(env.spec.arms)
     points_w = env.record.key_points_reference_t[0, :hands] @ s.torso_rotation_w[0].T + s.torso_pos_w[0]
     return torch.cat((env.sim.qpos[0].float(), points_w.flatten(), env.hand_force_w[0].flatten()))
 
 
-def idle(env: H1Env) -> PolicyFunction:
-    """A policy that does nothing."""
-    return lambda _: torch.zeros(env.num_envs, env.num_actions, device=env.device)
+def reference_actions(env: HumanoidEnv) -> torch.Tensor:
+    """Upper actions (N, U) that send the arms to their raw reference; absolute ones to where it is now, which is one
+    step late."""
+    upper, targets = env.action_slices["upper"], env.joint_targets
+    reference = env.motions.current().position
+    if env.cfg.actions.upper_mode == "residual":
+        return torch.zeros_like(reference)
+    return (reference - targets.default[upper]) / targets.scale[upper]
+
+
+def acting(env: HumanoidEnv, policy: PolicyFunction, upper_actions: str) -> PolicyFunction:
+    """`policy` as it is, or with the arms' raw reference in place of its upper actions; see `UPPER_ACTIONS`. A robot
+    whose base is held has no policy."""
+    if env.cfg.fixed_base:
+        return idle(env)
+    if upper_actions == "policy":
+        return policy
+    lower = env.action_slices["lower"]
+    return lambda observations: torch.cat((policy(observations)[:, lower], reference_actions(env)), 1)
+
+
+def idle(env: HumanoidEnv) -> PolicyFunction:
+    """A policy that leaves the legs in their default pose and sends the arms to their reference."""
+    legs = torch.zeros(env.num_envs, env.num_lower, device=env.device)
+    return lambda _: torch.cat((legs, reference_actions(env)), 1)
 
 
 def arm_static_torque(arms: Arms, s: RobotState, force_w: torch.Tensor) -> torch.Tensor:
@@ -128,18 +143,17 @@ def arm_static_torque(arms: Arms, s: RobotState, force_w: torch.Tensor) -> torch
     return (held - rotate_inverse(arms.chains.jacobian(s.arms), force_t)).flatten(1)
 
 
-def trajectory_row(env: H1Env, fell: torch.Tensor) -> dict[str, torch.Tensor]:
+def trajectory_row(env: HumanoidEnv, fell: torch.Tensor) -> dict[str, torch.Tensor]:
     """One step's row (N, ...) of a `Trajectory`, just after `env.step`; `fell` (N,) from its extras."""
     r, upper = env.record, env.action_slices["upper"]
     s, hands = r.state, len(env.spec.arms)
     offset_t = (r.key_points_t - r.key_points_reference_t)[:, :hands]
     return {
         "velocity": torch.cat((s.torso_linear_velocity_h[:, :2], s.yaw_rate.unsqueeze(1)), 1),
-        "command": torch.cat((r.command.velocity_h, r.command.yaw_rate.unsqueeze(1)), 1),
-        "stand": r.command.stand > 0.5,
-        "told_to_stand": env.commands.told_to_stand,
+        "command": env.commands.asked_velocity.clone(),
+        "stand": env.commands.asked_to_stand,
         "height": s.height,
-        "height_command": r.command.height,
+        "height_command": env.commands.asked_height.clone(),
         "position": s.torso_pos_w[:, :2],
         "arm_error": s.joint_pos[:, upper] - r.reference.position,
         "arm_velocity": s.joint_vel[:, upper],

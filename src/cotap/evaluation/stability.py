@@ -12,11 +12,13 @@ import torch
 from cotap.checks import require_positive_int, require_range
 from cotap.compliance.interface import LawParameters
 from cotap.compliance.laws import LAWS, LawConfig
-from cotap.envs import H1Env, H1EnvConfig
-from cotap.envs.persistence import uniform
+from cotap.envs import HumanoidEnv, HumanoidEnvConfig
+from cotap.envs.scripted_forces import ForceProfile
 from cotap.evaluation.linearization import linearize
-from cotap.evaluation.quiet import quiet
-from cotap.evaluation.report import save_figure
+from cotap.evaluation.protocol import HELD, Protocol, select_motion
+from cotap.evaluation.report import heading, save_figure
+from cotap.evaluation.rollout import PolicyFunction, idle
+from cotap.persistence import uniform
 from cotap.robots import RobotSpec
 from cotap.robots.chains import arm_model
 
@@ -26,17 +28,17 @@ _CHUNK = 1000
 
 
 @dataclass
-class Stability:
-    """Linearised closed loop over random poses, and the energy that forces on the hands can draw."""
+class Stability(Protocol):
+    """Linearised closed loop of an arm's law over random poses, and the energy that can be drawn from it."""
 
+    num_envs: int = 256
+    """Trials of energy: in half of them the stiffness changes meanwhile."""
     poses: int = 10_000
     """Arm poses to linearise at, uniform within the joints' limits."""
     walls: tuple[float, ...] = (0.0, 100.0, 1000.0, 10000.0)
     """Springs that hold the hand while it is linearised; 0 leaves it free [N/m]."""
     load_rad: float = 0.1
     """Standard deviation of joint errors at which loops are linearised as well, as a load makes them [rad]."""
-    num_envs: int = 256
-    """Trials of energy: in half of them the stiffness changes meanwhile."""
     seconds: float = 5.0
     """Length of a trial [s]."""
     settle_seconds: float = 6.0
@@ -49,11 +51,10 @@ class Stability:
     """Stiffness changes between 1 / sqrt(factor) and sqrt(factor) of the one commanded."""
     change_seconds: float = 0.5
     """How long it stays there [s]."""
-    seed: int = 0
-    """Seed of poses, forces and changes."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
+        super().check()
         require_positive_int("poses", self.poses)
         require_range("num_envs", self.num_envs, 2, 1_000_000)
         for i, wall in enumerate(self.walls):
@@ -67,14 +68,28 @@ class Stability:
         require_range("change_factor", self.change_factor, 1.0, 1000.0)
         require_range("change_seconds", self.change_seconds, 0.02, 3600.0)
 
-    def configure(self, env: H1EnvConfig) -> H1EnvConfig:
-        """Turn an environment into that of the trials of energy. Changes and returns `env`."""
-        self.check()
-        quiet(env)
-        env.num_envs, env.seed, env.fixed_base = self.num_envs, self.seed, True
-        env.motions.clips.share = 0.0
-        env.terminations.episode_s = 1e6
-        return env
+    def configure(self, env_cfg: HumanoidEnvConfig) -> HumanoidEnvConfig:
+        """Turn the environment that a policy was trained in into this protocol's. Changes and returns `env_cfg`."""
+        super().configure(env_cfg)
+        env_cfg.fixed_base = True
+        select_motion(env_cfg.motions.clips, (HELD,), "")
+        env_cfg.forces.scripted = ForceProfile((1.0, 1.0, 1.0), "both", start_s=0.0)
+        return env_cfg
+
+    def evaluate(self, env: HumanoidEnv, policy: PolicyFunction) -> dict[str, Any]:  # noqa: ARG002
+        """Analyse and measure the left arm's law. Returns the measured part of the JSON."""
+        arms = env.cfg.upper_body
+        rates = growth_rates(env.spec, arms.built(arms.left), self)
+        energy = energy_summary(exchanged_energy(env, self))
+        return {"num_poses": self.poses, "linearised": rates, "energy": energy}
+
+    def table(self, result: dict[str, Any]) -> str:
+        """Both parts as Markdown."""
+        return table(result)
+
+    def plot(self, path: Path, result: dict[str, Any]) -> None:
+        """Growth and share of unstable poses per wall, and trials that energy is drawn from."""
+        plot(path, result)
 
 
 def random_poses(spec: RobotSpec, count: int, rng: torch.Generator) -> torch.Tensor:
@@ -116,58 +131,44 @@ def growth_rates(spec: RobotSpec, law: LawConfig, protocol: Stability) -> list[d
     return rows
 
 
-class SwingingForces:
-    """Forces on the hands that swing, each trial with a direction and a frequency of its own; heading frame."""
-
-    active = True
-
-    def __init__(self, protocol: Stability, num_hands: int, rng: torch.Generator, device: torch.device | str) -> None:
-        n = protocol.num_envs
-        direction = torch.randn(n, num_hands, 3, generator=rng)
-        amplitude = protocol.force * direction / direction.norm(dim=-1, keepdim=True)
-        low, high = (math.log(bound) for bound in protocol.frequency)
-        rate = 2.0 * math.pi * uniform(rng, low, high, n, num_hands, 1).exp()
-        # The base, last, is left alone.
-        self._amplitude, self._rate = (torch.nn.functional.pad(x, (0, 0, 0, 1)).to(device) for x in (amplitude, rate))
-        self._start_s = protocol.settle_seconds
-
-    def reset(self, mask: torch.Tensor, rng: torch.Generator) -> None:
-        """Trials go on as they are."""
-
-    def at(self, time_s: torch.Tensor) -> torch.Tensor:
-        """Forces (N, H + 1, 3) [N] on hands and base at times (N,) [s]."""
-        since = (time_s - self._start_s)[:, None, None]
-        return (since > -1e-4) * torch.sin(self._rate * since) * self._amplitude
+def swings(protocol: Stability, num_hands: int, rng: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
+    """Amplitudes (N, H, 3) [N], heading frame, and angular frequencies (N, H, 1) [rad/s] of the forces on the hands."""
+    n = protocol.num_envs
+    direction = torch.randn(n, num_hands, 3, generator=rng)
+    low, high = (math.log(bound) for bound in protocol.frequency)
+    rate = 2.0 * math.pi * uniform(rng, low, high, n, num_hands, 1).exp()
+    return protocol.force * direction / direction.norm(dim=-1, keepdim=True), rate
 
 
-def exchanged_energy(env: H1Env, protocol: Stability) -> torch.Tensor:
+def exchanged_energy(env: HumanoidEnv, protocol: Stability) -> torch.Tensor:
     """Energy (T, N) that forces on the hands have put into the robot since their onset, at rest [J].
 
     Nothing is stored at rest, so that a negative one has been drawn from the law. Both hands count together, and what
-    they do in the world, as the waist passes energy on from one to the other. In the second half of the worlds the
+    they do in the world, as the waist passes energy on from one to the other. In the second half of the envs the
     stiffness changes.
     """
     rng = torch.Generator().manual_seed(protocol.seed)
     env.motions.hold(random_poses(env.spec, env.num_envs, rng).flatten(1) * 0.5)
-    forces = SwingingForces(protocol, len(env.spec.arms), rng, env.device)
-    env.scripted = forces  # pyright: ignore[reportAttributeAccessIssue]
+    amplitude, rate = (x.to(env.device) for x in swings(protocol, len(env.spec.arms), rng))
     env.reset()
     stiffness = env.upper_body.parameters.stiffness.clone()
     changing = torch.arange(env.num_envs, device=env.device) >= env.num_envs // 2
     hold = round(protocol.change_seconds / env.dt)
     energy = torch.zeros(env.num_envs, device=env.device)
     rows = []
-    action = torch.zeros(env.num_envs, env.num_actions, device=env.device)
+    act = idle(env)
     settle = round(protocol.settle_seconds / env.dt)
     for step in range(settle + round(protocol.seconds / env.dt)):
         if step >= settle and (step - settle) % hold == 0:
             draw = uniform(rng, -0.5, 0.5, *stiffness.shape).to(env.device)
             changed = stiffness * protocol.change_factor**draw
             env.upper_body.parameters.stiffness = torch.where(changing[:, None, None], changed, stiffness)
+        since = max(step - settle, 0) * env.dt
+        env.forces.scripted.amplitude_h[:, :-1] = torch.sin(rate * since) * amplitude
         before = env.state.hand_pos_w
-        _, _, _, extras = env.step(action)
+        _, _, _, extras = env.step(act({}))
         work = (env.hand_force_w * (env.state.hand_pos_w - before)).sum((1, 2))
-        # Where a world has diverged it has been restarted: it has given all that can be.
+        # Where an env has diverged it has been restarted: it has given all that can be.
         work = torch.where(extras["falls"], torch.full_like(work, -math.inf), work)
         energy = energy + torch.nan_to_num(work, nan=-math.inf, posinf=-math.inf)
         if step >= settle:
@@ -206,7 +207,7 @@ def table(content: dict[str, Any]) -> str:
     for name, row in content["energy"].items():
         numbers = [f"{row[k]:.4f}" if row[k] is not None else "-" for k in ("mean_least_energy", "least_energy")]
         lines.append(f"| {name.split('_')[0]} | {numbers[0]} | {numbers[1]} | {row['share_drawn']:.1%} |")
-    return "\n".join([*lines, "", f"stability, {content['method']}: {content['num_poses']} poses"])
+    return "\n".join([*lines, "", f"{heading(content)}: {content['num_poses']} poses"])
 
 
 def plot(path: Path, content: dict[str, Any]) -> None:

@@ -10,45 +10,77 @@ from typing import Any
 import torch
 
 from cotap.agents.actors import as_dict
-from cotap.checks import require_finite, require_one_of, require_positive_int, require_range
+from cotap.checks import require_finite, require_one_of, require_range
 from cotap.compliance import condition_number
-from cotap.envs import H1Env, H1EnvConfig
-from cotap.envs.commands import STEADY_RAD
-from cotap.evaluation.quiet import quiet
-from cotap.evaluation.report import save_figure
-from cotap.evaluation.rollout import PolicyFunction, idle
-from cotap.evaluation.scenario import PELVIS, mirrored_pose
+from cotap.compliance.laws import WITHOUT_STIFFNESS
+from cotap.envs import HumanoidEnv, HumanoidEnvConfig
+from cotap.envs.scripted_forces import ForceProfile
+from cotap.evaluation.protocol import HELD, Protocol, mirrored_pose, select_motion
+from cotap.evaluation.report import heading, save_figure
+from cotap.evaluation.rollout import UPPER_ACTIONS, PolicyFunction, acting
+from cotap.evaluation.scenario import PELVIS
 
 
 @dataclass
-class StaticStiffness:
-    """Loads from nothing to `force` on one hand, each in worlds of its own."""
+class HeldLoad(Protocol):
+    """What the protocols have in common that load one hand and let it settle."""
 
-    force: tuple[float, float, float] = (0.0, 0.0, -10.0)
-    """Full load along x, y and z of the heading frame [N]."""
     hand: str = "left"
     """left or right."""
     pelvis: str = "fixed"
     """fixed: held in the air, no policy. free: standing, legs under the policy."""
-    arm_pose: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.3)
-    """Arm joints [rad], as of the left arm; the right arm takes the mirror image."""
-    levels: int = 11
-    """Number of loads, from zero to full."""
-    repeats: int = 1
-    """Worlds per load."""
+    upper_actions: str = "reference"
+    """What moves the arms (pelvis free): policy, or reference for the raw reference instead of its upper actions."""
     settle_seconds: float = 10.0
-    """How long a load is left to settle [s]; the last second is measured."""
-    arm_actions: bool = False
-    """Let the policy's own residual move the arms (pelvis free)."""
-    torque_limit_scale: float = 1.0
-    """Factor on the robot's torque limits."""
-    seed: int = 0
-    """Seed of worlds."""
+    """How long the robot is left to settle without the load, then with it; the last second of each is measured [s]."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
+        super().check()
         require_one_of("hand", self.hand, ("left", "right"))
         require_one_of("pelvis", self.pelvis, PELVIS)
+        require_one_of("upper_actions", self.upper_actions, UPPER_ACTIONS)
+        require_range("settle_seconds", self.settle_seconds, 2.0, 600.0)
+
+    @property
+    def window(self) -> dict[str, float]:
+        """What is measured, from the start [s]."""
+        return {"start": 2.0 * self.settle_seconds - 1.0, "end": 2.0 * self.settle_seconds}
+
+    def configure(self, env_cfg: HumanoidEnvConfig) -> HumanoidEnvConfig:
+        """Turn the environment that a policy was trained in into this protocol's. Changes and returns `env_cfg`."""
+        super().configure(env_cfg)
+        env_cfg.fixed_base = self.pelvis == "fixed"
+        select_motion(env_cfg.motions.clips, (HELD,), "")
+        env_cfg.forces.scripted = ForceProfile((1.0, 1.0, 1.0), self.hand, self.settle_seconds)
+        return env_cfg
+
+    def load(self, env: HumanoidEnv, force_h: torch.Tensor) -> int:
+        """Have every env stand and load the hand by `force_h` (N, 3) [N], heading frame. Returns which hand that is."""
+        n, side = env.num_envs, [arm.side for arm in env.spec.arms].index(self.hand)
+        height = torch.full((n,), env.spec.nominal_height_m)
+        env.commands.override(torch.zeros(n, 2), torch.zeros(n), torch.ones(n), height)
+        env.forces.scripted.amplitude_h.zero_()
+        env.forces.scripted.amplitude_h[:, side] = force_h.to(env.device)
+        return side
+
+
+@dataclass
+class StaticStiffness(HeldLoad):
+    """Commanded against effective stiffness of a hand under loads from nothing to `force`."""
+
+    num_envs: int = 11
+    """Number of envs, dealt to the loads evenly."""
+    force: tuple[float, float, float] = (0.0, 0.0, -10.0)
+    """Full load along x, y and z of the heading frame [N]."""
+    levels: int = 11
+    """Number of loads, from zero to full."""
+    arm_pose: tuple[float, ...] = ()
+    """Arm joints [rad], as of the left arm; the right arm takes the mirror image. Empty for the default pose."""
+
+    def check(self) -> None:
+        """Raise ValueError naming the first field that is out of its range."""
+        super().check()
         for i, value in enumerate(self.force):
             require_finite(f"force[{i}]", value)
         if not any(self.force):
@@ -56,32 +88,34 @@ class StaticStiffness:
         for i, value in enumerate(self.arm_pose):
             require_range(f"arm_pose[{i}]", value, -math.pi, 1.5 * math.pi)
         require_range("levels", self.levels, 2, 1000)
-        require_positive_int("repeats", self.repeats)
-        require_range("settle_seconds", self.settle_seconds, 2.0, 600.0)
-        require_range("torque_limit_scale", self.torque_limit_scale, 1e-3, 1e6)
+        if self.num_envs < self.levels:
+            raise ValueError(f"num_envs must be at least levels ({self.levels}), got {self.num_envs}")
 
-    @property
-    def num_envs(self) -> int:
-        """Worlds in all."""
-        return self.levels * self.repeats
+    def prepare(self, env: HumanoidEnv) -> None:
+        """Give every env its load, and its arms their pose."""
+        shares = torch.linspace(0.0, 1.0, self.levels)[torch.arange(env.num_envs) % self.levels]
+        self.load(env, shares.unsqueeze(1) * torch.tensor(self.force))
+        env.motions.hold(mirrored_pose(env, self.arm_pose))
 
-    def configure(self, env: H1EnvConfig) -> H1EnvConfig:
-        """Turn an environment into this protocol's. Changes and returns `env`."""
-        self.check()
-        quiet(env)
-        env.num_envs, env.seed, env.torque_limit_scale = self.num_envs, self.seed, self.torque_limit_scale
-        env.fixed_base = self.pelvis == "fixed"
-        env.motions.clips.share = 0.0
-        env.terminations.episode_s = 1e6
-        env.commands.steady_rad = STEADY_RAD
-        env.commands.stand_probability, env.commands.height_offset = 1.0, (0.0, 0.0)
-        env.force.force, env.force.hand, env.force.start_s = self.force, self.hand, self.settle_seconds
-        return env
+    def evaluate(self, env: HumanoidEnv, policy: PolicyFunction) -> dict[str, Any]:
+        """Run in an environment that is prepared. Returns the measured part of the JSON."""
+        law = env.cfg.upper_body.of(self.hand)
+        commanded = None if law.name in WITHOUT_STIFFNESS else law.stiffness
+        measured = measure(env, self, policy)
+        return {"num_falls": measured.num_falls, **summary(measured, commanded), "window": self.window}
+
+    def table(self, result: dict[str, Any]) -> str:
+        """Commanded and effective stiffness, axis by axis, as Markdown."""
+        return table(result)
+
+    def plot(self, path: Path, result: dict[str, Any]) -> None:
+        """Force against displacement along the load."""
+        plot(path, result)
 
 
 @dataclass(frozen=True)
 class StaticResult:
-    """What was measured. L loads, each the mean of its worlds that did not fall."""
+    """What was measured. L loads, each the mean of its envs that did not fall."""
 
     force: torch.Tensor
     """(L, 3) [N]."""
@@ -93,7 +127,7 @@ class StaticResult:
     """Whether an arm joint was at its torque limit at the end."""
     num_falls: int
     spread: torch.Tensor = field(default_factory=lambda: torch.zeros(0))
-    """(L, 3) standard deviation over worlds [m]."""
+    """(L, 3) standard deviation over envs [m]."""
 
     def effective_stiffness(self) -> list[float | None]:
         """Full load over displacement, per axis that is loaded [N/m]; None where nothing pushes or nothing moves."""
@@ -117,17 +151,16 @@ class Settled:
     """(N,) bool: an arm joint was at its torque limit at the end."""
 
 
-def settle(env: H1Env, policy: PolicyFunction | None, seconds: float, side: int, arm_actions: bool) -> Settled:
+def settle(env: HumanoidEnv, policy: PolicyFunction, seconds: float, side: int) -> Settled:
     """Let `env` settle for `seconds` without its scripted force, which must set in then, and again with it.
 
     Args:
-        env: The worlds.
-        policy: Who acts; None for nobody.
+        env: The envs.
+        policy: Who acts.
         seconds: Time before and after the force sets in, of which the last second is averaged [s].
         side: Which hand is looked at.
-        arm_actions: Whether the policy's own arm actions count.
     """
-    obs, act = env.reset(), policy or idle(env)
+    obs = env.reset()
     fell = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
     averages: list[torch.Tensor] = []
     steps, window = round(seconds / env.dt), round(1.0 / env.dt)
@@ -136,10 +169,7 @@ def settle(env: H1Env, policy: PolicyFunction | None, seconds: float, side: int,
     for begin in (0, steps):  # without the load, then with it
         total = torch.zeros(env.num_envs, 3, device=env.device)
         for step in range(steps):
-            action = act(as_dict(obs, env.device)).clone()
-            if not arm_actions:
-                action[:, env.action_slices["upper"]] = 0.0
-            obs, _, _, extras = env.step(action)
+            obs, _, _, extras = env.step(policy(as_dict(obs, env.device)))
             fell |= extras["falls"]
             if step >= steps - window:
                 total += env.record.state.arms.tip[:, side] / window
@@ -154,25 +184,19 @@ def settle(env: H1Env, policy: PolicyFunction | None, seconds: float, side: int,
     return Settled(moved.cpu(), condition.cpu(), fell.cpu(), saturated.cpu())
 
 
-def measure(env: H1Env, protocol: StaticStiffness, policy: PolicyFunction | None) -> StaticResult:
-    """Run the protocol in `env`, made from its config."""
+def measure(env: HumanoidEnv, protocol: StaticStiffness, policy: PolicyFunction) -> StaticResult:
+    """Run the protocol in `env`, which it has prepared."""
     side = [arm.side for arm in env.spec.arms].index(protocol.hand)
-    levels = torch.linspace(0.0, 1.0, protocol.levels).repeat_interleave(protocol.repeats)
-    env.scripted.amplitude_h = env.scripted.amplitude_h * levels[:, None, None].to(env.device)
-    env.motions.hold(mirrored_pose(env, protocol.arm_pose))
-    settled = settle(
-        env, policy if protocol.pelvis == "free" else None, protocol.settle_seconds, side, protocol.arm_actions
-    )
-    means, spreads, forces = [], [], []
-    for level in range(protocol.levels):
-        mine = slice(level * protocol.repeats, (level + 1) * protocol.repeats)
-        standing = settled.moved[mine][~settled.fell[mine]]
+    settled = settle(env, acting(env, policy, protocol.upper_actions), protocol.settle_seconds, side)
+    level = torch.arange(env.num_envs) % protocol.levels
+    means, spreads = [], []
+    for i in range(protocol.levels):
+        standing = settled.moved[(level == i) & ~settled.fell]
         means.append(standing.mean(0) if len(standing) else torch.full((3,), math.nan))
         spreads.append(standing.std(0) if len(standing) > 1 else torch.zeros(3))
-        forces.append(env.scripted.amplitude_h[level * protocol.repeats, side])
     return StaticResult(
-        torch.stack(forces), torch.stack(means), float(settled.condition.mean()), bool(settled.saturated.any()),
-        int(settled.fell.sum()), torch.stack(spreads),
+        env.forces.scripted.amplitude_h[: protocol.levels, side].cpu(), torch.stack(means),
+        float(settled.condition.mean()), bool(settled.saturated.any()), int(settled.fell.sum()), torch.stack(spreads),
     )  # fmt: skip
 
 
@@ -215,24 +239,26 @@ def table(content: dict[str, Any]) -> str:
     if content["torque_saturated"]:
         notes.append("an arm joint is at its torque limit")
     if content["num_falls"]:
-        notes.append(f"{content['num_falls']} of {content['num_envs']} worlds fell")
-    return "\n".join([*lines, "", f"static-stiffness, {content['method']}: {'; '.join(notes)}"])
+        notes.append(f"{content['num_falls']} of {content['num_envs']} envs fell")
+    return "\n".join([*lines, "", f"{heading(content)}: {'; '.join(notes)}"])
 
 
-def plot(path: Path, result: StaticResult, commanded: tuple[float, ...] | None, load: tuple[float, ...]) -> None:
+def plot(path: Path, content: dict[str, Any]) -> None:
     """Force against displacement along the load, with the line that the commanded stiffness asks for."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    direction = torch.tensor(load) / torch.tensor(load).norm()
-    force, moved = result.force @ direction, result.displacement @ direction
+    curve, commanded = content["curve"], content["effective_stiffness"]["commanded"]
+    load = torch.tensor(content["settings"]["force"])
+    direction, forces = load / load.norm(), torch.tensor(curve["force"])
+    moved = torch.tensor([[math.nan if v is None else v for v in row] for row in curve["displacement"]])
     figure, axis = plt.subplots(figsize=(5.2, 4.0), constrained_layout=True)
-    axis.plot(1e3 * moved, force, "o-", color="#2171b5", label="measured")
+    axis.plot(1e3 * moved @ direction, forces @ direction, "o-", color="#2171b5", label="measured")
     if commanded is not None:
-        ideal = (result.force / torch.tensor(commanded)) @ direction
-        axis.plot(1e3 * ideal, force, "--", color="0.4", label="commanded")
+        ideal = (forces / torch.tensor(commanded)) @ direction
+        axis.plot(1e3 * ideal, forces @ direction, "--", color="0.4", label="commanded")
     axis.set(xlabel="displacement along the load [mm]", ylabel="force [N]")
     axis.grid(alpha=0.2)
     axis.legend(frameon=False)

@@ -1,4 +1,4 @@
-"""How a hand comes to rest after a blow: energy of its oscillation, overshoots, settling (paper, Fig. 9)."""
+"""How a hand comes to rest after a push: energy of its oscillation, overshoots, settling (paper, Fig. 9)."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ BAND = 0.1
 def transient_measures(
     t: Trajectory, onset: int, release: int, end: int, hit: list[int], before_s: float
 ) -> dict[str, torch.Tensor]:
-    """What the hands in `hit` do about where they were, from the end of a blow on, per world, (N,) each.
+    """What the hands in `hit` do about where they were, from the end of a push on, per env, (N,) each.
 
     A hand's displacement is its offset from the reference, which the torso carries, less the mean offset of the time
     before the onset. It counts as positive on the side of the largest displacement.
 
-    - `transient_energy`: mean of half its velocity squared, from the end of the blow to the window's end [J/kg].
+    - `transient_energy`: mean of half its velocity squared, from the end of the push to the window's end [J/kg].
     - `oscillation_energy`: of that what moves after the hand has first come back to where it was: what a hand that
       returns without swinging through does not have. A linear oscillator of frequency w and damping ratio z, struck to
       a velocity v, has v^2 / (8 z w) in all (times 1 s), and that times exp(-2 pi z / sqrt(1 - z^2)) after its return.
@@ -31,14 +31,14 @@ def transient_measures(
 
     Args:
         t: What was recorded.
-        onset: Step at which the blow begins.
+        onset: Step at which the push begins.
         release: Step at which it ends.
         end: Step at which the window ends.
         hit: Indices of the hands.
         before_s: Time before the onset that displacements are relative to [s].
 
     Returns:
-        Means over the hands in `hit`; NaN for a world that fell before the window's end, and `settle_s` also for one
+        Means over the hands in `hit`; NaN for an env that fell before the window's end, and `settle_s` also for one
         that fell later or did not settle.
     """
     moved = t.hand_offset[:, :, hit]

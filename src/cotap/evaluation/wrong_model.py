@@ -1,4 +1,4 @@
-"""Laws that are told wrong about the arms that they drive: what a law's model is worth shows when it is off."""
+"""Laws with a wrong model of the arms that they drive: what a law's model is worth shows when it is off."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import torch
 
-from cotap.envs import H1Env
+from cotap.envs import HumanoidEnv
 from cotap.envs.state import RobotState
 from cotap.envs.upper_body import UpperBody, UpperBodyConfig
 from cotap.robots import RobotSpec
@@ -49,8 +49,9 @@ class MisjudgingUpperBody(UpperBody):
         super().send(replace(state, arms=self._chains.pose(q)), target, velocity)
 
 
-def misjudge(env: H1Env, length: float, mass: float) -> None:
+def misjudge(env: HumanoidEnv, length: float, mass: float) -> None:
     """From now on the laws of `env` take the arms for longer and heavier by these factors, see `misjudged_arms`."""
     believed = misjudged_arms(env.spec, length, mass)
     with torch.device(env.device):
-        env.upper_body = MisjudgingUpperBody(env.cfg.upper_body, believed, env.num_envs, env.dt)
+        wrong = MisjudgingUpperBody(env.cfg.upper_body, believed, env.num_envs, env.dt)
+    env.upper_body = env.actuation.upper_body = wrong

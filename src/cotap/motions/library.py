@@ -182,9 +182,18 @@ def read_npz(path: str | Path) -> dict[str, np.ndarray]:
         raise MotionError(f"{str(path)!r} is damaged or no npz file of plain numbers: {reason_of(error)}") from error
 
 
+def _shipped_name(spec: RobotSpec) -> str:
+    return f"{spec.name}_motions.npz"
+
+
+def has_shipped_library(spec: RobotSpec) -> bool:
+    """Whether a library for this robot comes with the package."""
+    return files("cotap.motions").joinpath(_shipped_name(spec)).is_file()
+
+
 def shipped_library(spec: RobotSpec) -> MotionLibrary:
     """The library that comes with the package. Raises MotionError if there is none for this robot."""
-    resource = files("cotap.motions").joinpath(f"{spec.name}_motions.npz")
+    resource = files("cotap.motions").joinpath(_shipped_name(spec))
     if not resource.is_file():
         raise MotionError(
             f"no motion library is shipped for robot {spec.name!r}; import one with python -m cotap.motions"

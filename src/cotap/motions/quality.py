@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from cotap.motions.elbow import elbow_index
 from cotap.motions.library import FPS, MotionClip
 from cotap.motions.processing import ClipReport, JointMotion, resample
 from cotap.motions.retarget import arm_direction
@@ -42,10 +43,10 @@ def forward_kinematics(spec: RobotSpec, arms: np.ndarray) -> tuple[np.ndarray, n
     chains = arm_chains(spec)
     q = torch.as_tensor(arms, dtype=torch.float32).unflatten(1, (len(spec.arms), -1))
     pose = chains.pose(q)
-    return (
-        pose.anchors[:, :, 1].double().numpy(), pose.anchors[:, :, -1].double().numpy(), pose.tip.double().numpy(),
-        chains.jacobian(pose).double().numpy(),
-    )  # fmt: skip
+    elbow = pose.anchors[:, range(len(spec.arms)), [elbow_index(spec, arm) for arm in spec.arms]]
+    points = (pose.anchors[:, :, 1], elbow, pose.tip, chains.jacobian(pose))
+    shoulder, elbow, hand, jacobian = (p.double().numpy() for p in points)
+    return shoulder, elbow, hand, jacobian
 
 
 def assess(spec: RobotSpec, motion: JointMotion, clip: MotionClip, report: ClipReport) -> ClipQuality:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from cotap.motions.elbow import elbow_index
 from cotap.motions.library import FPS
 from cotap.robots import RobotSpec
 from cotap.robots.chains import arm_chains
@@ -29,12 +30,15 @@ def slow_down(spec: RobotSpec, arms: np.ndarray) -> np.ndarray:
     low, high = torch.tensor([j.range_rad for j in joints], dtype=torch.float32).unbind(1)
     largest = _MARGIN / FPS * torch.tensor([j.velocity_limit_rad_s for j in joints], dtype=torch.float32)
     chains = arm_chains(spec)
+    each, elbows = range(len(spec.arms)), [elbow_index(spec, arm) for arm in spec.arms]
 
     def points(q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         pose = chains.pose(q.unflatten(1, (len(spec.arms), -1)))
-        return pose.tip, pose.anchors[:, :, -1]
+        return pose.tip, pose.anchors[:, each, elbows]
 
-    elbows = [i for i, j in enumerate(joints) if j.name in {arm.joints[-1] for arm in spec.arms}]
+    def flexions(q: torch.Tensor) -> torch.Tensor:
+        return q.unflatten(1, (len(spec.arms), -1))[:, each, elbows]
+
     start = torch.as_tensor(arms, dtype=torch.float32)
     hand, elbow = points(start)
     q = start.clone().requires_grad_(True)
@@ -45,7 +49,7 @@ def slow_down(spec: RobotSpec, arms: np.ndarray) -> np.ndarray:
         new_hand, new_elbow = points(q)
         step = q.diff(dim=0)
         error = (new_hand - hand).square().sum() + _ELBOW_WEIGHT * (new_elbow - elbow).square().sum()
-        error = error + _FLEXION_WEIGHT * (q - start)[:, elbows].square().sum()
+        error = error + _FLEXION_WEIGHT * flexions(q - start).square().sum()
         (error + _SPEED_WEIGHT * (step.abs() - largest).clamp_min(0.0).square().sum()).backward()
         optimizer.step()
         schedule.step()

@@ -79,7 +79,7 @@ def plot_clip(path: Path, clip: MotionClip, spec: RobotSpec) -> None:
 def _sheet(path: Path, clips: list[MotionClip], spec: RobotSpec) -> None:
     """One row per clip: the robot standing, its arms at evenly spaced moments."""
     legs = torch.tensor([j.default_rad for j in spec.joints[: len(spec.lower_joints)]], dtype=torch.float64)
-    base = torch.tensor([0.0, 0.0, spec.nominal_height_m, 1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+    base = torch.tensor([0.0, 0.0, spec.base_height_m, 1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
     poses = [
         torch.cat((base, legs, torch.as_tensor(clip.arms[i], dtype=torch.float64)))
         for clip in clips

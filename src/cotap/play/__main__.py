@@ -1,4 +1,4 @@
-"""`python -m cotap.play`: the shipped policy in the browser, to push, to lead, and to turn the stiffness of."""
+"""`python -m cotap.play`: a policy in the browser, to push, to lead, and to turn the stiffness of."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import tyro
 
 from cotap.checks import require_one_of
 from cotap.play import ROBOTS
-from cotap.play.lean import import_tensordict, uncollected
+from cotap.play.startup import import_tensordict, uncollected
 
 if TYPE_CHECKING:
     from viser import ViserServer
@@ -30,9 +30,9 @@ class PlayOptions:
     port: int = 8080
     """Port to listen at."""
     checkpoint: tuple[str, ...] = ()
-    """Checkpoints to choose from beside the shipped ones; the first of these runs at first."""
+    """Checkpoints of one robot to choose from beside its shipped ones; the first of these runs at first."""
     robot: str = ""
-    """Robot whose policies these are; h1 where none is given. A recording has its own."""
+    """Robot whose shipped policies run, by default h1. Checkpoints and recordings have their own."""
     replay: str = ""
     """Show this recording (.npz) instead of simulating."""
     output: str = "runs/play"
@@ -58,6 +58,8 @@ def _run(options: PlayOptions) -> int:
     begin = time.perf_counter()
     if options.replay and (options.robot or options.checkpoint):
         raise ValueError("a recording has its own robot and policies: leave out --robot and --checkpoint with --replay")
+    if options.checkpoint and options.robot:
+        raise ValueError("a checkpoint has its own robot: leave out --robot with --checkpoint")
     try:
         with uncollected():
             from cotap.play.server import open_server
@@ -82,7 +84,7 @@ def _live(options: PlayOptions, server: ViserServer) -> App:
     from cotap.play.scene import Scene
     from cotap.robots import ROBOTS as KNOWN_ROBOTS
 
-    robot = options.robot or "h1"
+    robot = _robot_of(options.checkpoint[0]) if options.checkpoint else options.robot or "h1"
     require_one_of("robot", robot, KNOWN_ROBOTS)
     scene = Scene(server, KNOWN_ROBOTS[robot](), len(ROBOTS))
     server.flush()  # browsers prepare it while the rest is loaded
@@ -91,15 +93,30 @@ def _live(options: PlayOptions, server: ViserServer) -> App:
 
     import_tensordict()  # before what would import it whole
 
-    from cotap.evaluation.policy import shipped_checkpoint, shipped_names
     from cotap.play.app import App
     from cotap.play.session import Session
 
     torch.set_num_threads(1)  # two robots: more would only wait for each other
-    checkpoints = {path: Path(path) for path in options.checkpoint}
-    names = sorted(shipped_names(), key=lambda name: name != "cotap")  # the first is what the page begins with
-    checkpoints |= {f"shipped {name}": shipped_checkpoint(name) for name in names}
+    checkpoints = {path: Path(path) for path in options.checkpoint} | _shipped_policies(robot)
+    if not checkpoints:
+        raise ValueError(f"no policy of robot {robot!r} is shipped; train one, and give it with --checkpoint")
     return App(server, scene, Session(checkpoints, options.seed), Path(options.output))
+
+
+def _robot_of(checkpoint: str) -> str:
+    import_tensordict()
+
+    from cotap.evaluation.policy import load_policy
+
+    return load_policy(checkpoint).env_config.robot
+
+
+def _shipped_policies(robot: str) -> dict[str, Path]:
+    """Those of a robot, by the names that are shown; the first is what the page begins with."""
+    from cotap.evaluation.policy import shipped_checkpoint, shipped_names
+
+    names = [name for name in (f"{robot}-cotap", f"{robot}-base") if name in shipped_names()]
+    return {f"shipped {name}": shipped_checkpoint(name) for name in names}
 
 
 def _replay(options: PlayOptions, server: ViserServer) -> Replay:

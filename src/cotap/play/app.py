@@ -36,14 +36,9 @@ class App:
         scene: Where it is drawn, of all robots.
         session: What is simulated.
         folder: Where recordings go.
-
-    Raises:
-        ValueError: the scene is of another robot than the session.
     """
 
     def __init__(self, server: viser.ViserServer, scene: Scene, session: Session, folder: Path) -> None:
-        if scene.robot != session.env.spec.name:
-            raise ValueError(f"the page shows {scene.robot!r}, but the policy is of {session.env.spec.name!r}: --robot")
         self.session, self.server, self.scene = session, server, scene
         self.mailbox = Mailbox(session.controls)
         self.notices = Notices(server)
@@ -53,7 +48,7 @@ class App:
         self._failure: BaseException | None = None
         self._recorder: Recorder | None = None
         self._changes: dict[str, Any] = {}
-        self._told: set[str] = set()
+        self._noticed: set[str] = set()
         self._latest: tuple[int, Sample] | None = None
         with server.atomic():
             self.panel = Panel(server, self.mailbox, session.sides, self.notices)
@@ -169,9 +164,6 @@ class App:
             f"{rate:.0f} control steps/s ({rate * s.dt:.2f} of real time)",
             f"falls: {', '.join(str(n) for n in s.falls[: self._shown()])}",
         ]  # fmt: skip
-        # Else nobody would know why a robot that is told to walk stands.
-        shown = list(zip(ROBOTS, s.braces, strict=True))[: self._shown()]
-        parts += [f"robot {name.upper()} braces itself" for name, braces in shown if braces]
         if self._recorder is not None:
             parts.append(f"**recording {self._recorder.seconds:.1f} s**")
         self.panel.status.content = " · ".join(parts)
@@ -219,14 +211,14 @@ class App:
         robot, hand = divmod(index, hands)
         name = f"{ROBOTS[robot]}.{self.session.sides[hand]}.drag"
         if event.phase == "start":
-            self._told.discard(name)
+            self._noticed.discard(name)
         point = None if event.phase == "end" else self.scene.to_robot(event.end_position, robot)
         try:
             _, notice = self.mailbox.set(name, point)
         except Refused as refusal:
             notice = str(refusal)
-        if notice and name not in self._told:  # a drag is many events: its first notice stands for all
-            self._told.add(name)
+        if notice and name not in self._noticed:  # a drag is many events: its first notice stands for all
+            self._noticed.add(name)
             self.notices.tell(notice, event.client, "not as sent")
 
     def _begin_recording(self) -> None:

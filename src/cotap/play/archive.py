@@ -20,7 +20,7 @@ class Archive:
 
     Args:
         folder: Made when it is first needed.
-        notices: Where people are told what was written.
+        notices: Say what was written.
     """
 
     def __init__(self, folder: Path, notices: Notices) -> None:

@@ -72,7 +72,7 @@ class Flag:
 
 @dataclass(frozen=True)
 class Point:
-    """A point in the world of one robot, or None for none."""
+    """A point in the world frame of one robot's env, or None for none."""
 
     label: str
     reach: float
@@ -113,8 +113,6 @@ class Ranges:
     laws: tuple[str, ...]
     motions: tuple[str, ...]
     checkpoints: tuple[str, ...]
-    senses_loads: bool
-    """Whether the policy was trained to lean against what pulls at its hands."""
 
 
 SPEED = Number("speed", 0.1, 4.0, 1.0, 0.1)
@@ -143,10 +141,9 @@ def make_controls(r: Ranges) -> dict[str, Control]:
             controls[f"held.{side}.{axis}"] = Number(f"{side}, {axis} [N]", -60.0, 60.0, 0.0, 1.0)
     for robot in ROBOTS:
         controls[f"{robot}.checkpoint"] = Choice("policy", r.checkpoints, r.checkpoints[0])
-        controls[f"{robot}.senses_loads"] = Flag(f"robot {robot.upper()} leans against loads", r.senses_loads)
         controls[f"{robot}.friction"] = Number("friction", 0.2, 1.5, 1.0, 0.05)
         controls[f"{robot}.mass_scale"] = Number("mass [nominal]", 0.8, 1.3, 1.0, 0.01)
-        controls[f"{robot}.load_kg"] = Number("pelvis load [kg]", -1.0, 10.0, 0.0, 0.5)
+        controls[f"{robot}.load_kg"] = Number("torso load [kg]", -1.0, 10.0, 0.0, 0.5)
         for side in r.sides:
             controls |= {f"{robot}.{side}.{name}": c for name, c in _law_controls(r.laws).items()}
             controls[f"{robot}.{side}.drag"] = Point("drag", 1e3)

@@ -33,21 +33,21 @@ class Push:
             raise Refused(f"a push must last between 0 and {PUSH_S:g} s, got {self.seconds:g} s")
 
 
-class HandLoads:
-    """The sum of everything that pulls on W robots' H hands, step by step.
+class HandForces:
+    """The sum of everything that pulls on N robots' H hands, step by step.
 
     Args:
-        num_worlds: W.
+        num_envs: N.
         sides: Names of the H hands.
         dt: Control step [s].
     """
 
-    def __init__(self, num_worlds: int, sides: tuple[str, ...], dt: float) -> None:
+    def __init__(self, num_envs: int, sides: tuple[str, ...], dt: float) -> None:
         self._sides, self._dt = sides, dt
         self.held_h = torch.zeros(len(sides), 3)
         """(H, 3) held loads, the same on every robot [N]."""
-        self.drag_w: list[list[tuple[float, ...] | None]] = [[None] * len(sides) for _ in range(num_worlds)]
-        """[W][H] where hands are dragged to, in their robot's world [m]; None where they are not."""
+        self.drag_w: list[list[tuple[float, ...] | None]] = [[None] * len(sides) for _ in range(num_envs)]
+        """[N][H] where hands are dragged to, world frame [m]; None where they are not."""
         self._pushes: list[tuple[torch.Tensor, int]] = []
 
     def push(self, push: Push) -> None:
@@ -61,19 +61,19 @@ class HandLoads:
         self._pushes = []
 
     def step(self, hand_w: torch.Tensor, heading_w: torch.Tensor) -> torch.Tensor:
-        """Forces (W, H, 3) of the coming step in the heading frame [N].
+        """Forces (N, H, 3) of the coming step in the heading frame [N].
 
         Args:
-            hand_w: (W, H, 3) where hands are [m].
-            heading_w: (W, 3, 3) heading frame to world.
+            hand_w: (N, H, 3) where hands are [m].
+            heading_w: (N, 3, 3) heading frame to world.
         """
         common = self.held_h + sum((force for force, _ in self._pushes), torch.zeros_like(self.held_h))
         self._pushes = [(force, left - 1) for force, left in self._pushes if left > 1]
         out = common.expand(len(self.drag_w), -1, -1).clone()
-        for w, row in enumerate(self.drag_w):
+        for i, row in enumerate(self.drag_w):
             for h, target in enumerate(row):
                 if target is not None:
-                    force_w = DRAG_N_M * (torch.tensor(target) - hand_w[w, h])
+                    force_w = DRAG_N_M * (torch.tensor(target) - hand_w[i, h])
                     force_w = force_w * min(1.0, DRAG_N / max(float(force_w.norm()), 1e-6))
-                    out[w, h] += heading_w[w].T @ force_w
+                    out[i, h] += heading_w[i].T @ force_w
         return out

@@ -26,14 +26,14 @@ class Panel:
         server: The page.
         mailbox: Where settings and requests go.
         sides: The arms.
-        notices: Where people are told what was refused.
+        notices: Say what was refused.
     """
 
     def __init__(self, server: viser.ViserServer, mailbox: Mailbox, sides: tuple[str, ...], notices: Notices) -> None:
         self._gui, self._mailbox, self._sides, self._notices = server.gui, mailbox, sides, notices
         self._handles: dict[str, Any] = {}
         self._good: dict[str, Any] = {name: control.default for name, control in mailbox.controls.items()}
-        self._second: list[Any] = []
+        self._second: list[viser.GuiFolderHandle] = []
         self.status = server.gui.add_markdown("")
         self._add_time()
         self.tabs = server.gui.add_tab_group()
@@ -140,10 +140,6 @@ class Panel:
             for side in self._sides:
                 for axis in AXES:
                     self.bind(f"held.{side}.{axis}")
-        for robot in ROBOTS:
-            handle = self.bind(f"{robot}.senses_loads")
-            if robot != ROBOTS[0]:
-                self._second.append(handle)
         self._gui.add_markdown("Drag an orange ball with the mouse: a spring pulls that hand after it.")
 
     def _push(self, direction: tuple[float, float, float]) -> Push:

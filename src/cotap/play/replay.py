@@ -112,7 +112,7 @@ class Replay:
             self._speed = self._accepted(SPEED, event, self._speed)
 
     def _accepted(self, number: Number, event: viser.GuiEvent[Any], before: float) -> float:
-        """What was sent, as it can be used; where that differs, people are told, and the page shows it."""
+        """What was sent, as it can be used; where that differs, a notice says so, and the page shows it."""
         try:
             value, notice = number.clean(event.target.value)
         except Refused as refusal:

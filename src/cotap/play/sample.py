@@ -8,21 +8,21 @@ import numpy as np
 import torch
 
 from cotap.compliance.laws import WITHOUT_STIFFNESS
-from cotap.envs import H1Env
+from cotap.envs import HumanoidEnv
 from cotap.evaluation.rollout import trajectory_row
 
 Sample = dict[str, np.ndarray]
-"""One step of W robots, (W, ...) each, by the names of `Trajectory` and of `recording.SCENE`."""
+"""One step of N robots, (N, ...) each, by the names of `Trajectory` and of `recording.SCENE`."""
 
 
-def take_sample(env: H1Env, fell: torch.Tensor, laws: list[list[str]], force_h: torch.Tensor) -> Sample:
+def take_sample(env: HumanoidEnv, fell: torch.Tensor, laws: list[list[str]], force_h: torch.Tensor) -> Sample:
     """The step that `env` has just made.
 
     Args:
-        env: W worlds.
-        fell: (W,) bool from the step's extras.
-        laws: [W][H] names of the arms' laws.
-        force_h: (W, H, 3) what pulled on the hands [N].
+        env: N envs.
+        fell: (N,) bool from the step's extras.
+        laws: [N][H] names of the arms' laws.
+        force_h: (N, H, 3) what pulled on the hands [N].
     """
     state, reference = env.record.state, env.record.reference.position
     points_w, reference_w = _hands_w(env, reference)
@@ -58,13 +58,13 @@ def effective_stiffness(jacobian: torch.Tensor, joint_stiffness: torch.Tensor) -
     return torch.linalg.inv(compliance + rigid).float()
 
 
-def _to_heading(env: H1Env) -> torch.Tensor:
+def _to_heading(env: HumanoidEnv) -> torch.Tensor:
     s = env.record.state
     return s.heading_w.transpose(1, 2) @ s.torso_rotation_w
 
 
-def _hands_w(env: H1Env, reference: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Hands and their references (W, H, 3) in the world; the reference is carried in the torso frame."""
+def _hands_w(env: HumanoidEnv, reference: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Hands and their references (N, H, 3), world frame; the reference is carried in the torso frame."""
     s = env.record.state
     wanted = env.reader.arm_chains.pose(reference.unflatten(1, (len(env.spec.arms), -1))).tip
     return s.hand_pos_w, s.torso_pos_w.unsqueeze(1) + wanted @ s.torso_rotation_w.transpose(1, 2)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:  # the scene is shown before torch is there
     from cotap.play.sample import Sample
 
 APART_M = 1.5
-"""How far to its right the second robot is shown from where its own world has it [m]."""
+"""How far to its right the second robot is shown from where its own env has it [m]."""
 ELLIPSOID_M = 3e-4
 """Half axis of an ellipsoid of stiffness per stiffness [m per N/m]: 30 cm for 1000 N/m."""
 ELLIPSOID_MAX_M = 0.5
@@ -36,7 +36,7 @@ COMMANDED, EFFECTIVE = (40, 110, 220), (240, 150, 60)
 
 
 class Scene:
-    """Draws samples. Robots' worlds are their own; here they stand beside each other.
+    """Draws samples. Robots' envs are their own; here they stand beside each other.
 
     Args:
         server: Where to draw.
@@ -49,7 +49,6 @@ class Scene:
         """How many robots, from the first on, are drawn; those that a sample lacks are not."""
         self.follow = True
         self.ellipsoids, self.contacts = True, True
-        self.robot = spec.name
         self._server, self._count, self._hands = server, count, len(spec.arms)
         model, self.shapes = visual_model(spec)
         self._pose = RobotPose(spec, model)
@@ -79,7 +78,7 @@ class Scene:
         sample = {name: value[np.minimum(np.arange(self._count), rows - 1)] for name, value in sample.items()}
         poses = [self._pose.of(qpos) for qpos in sample["qpos"]]
         apart = np.array([[0.0, -APART_M * i, 0.0] for i in range(self._count)])
-        # Following moves the world, not people's cameras: those stay theirs to turn.
+        # Following moves the scene, not people's cameras: those stay theirs to turn.
         centre = sample["qpos"][:shown, :2].mean(0) if self.follow else np.zeros(2)
         middle = apart[:shown].mean(0) if self.follow else np.zeros(3)
         self._offset = apart - middle - np.array([*centre, 0.0])
@@ -99,7 +98,7 @@ class Scene:
         self._server.scene.configure_default_lights(cast_shadow=on)
 
     def to_robot(self, point: tuple[float, float, float], robot: int) -> tuple[float, ...]:
-        """A point of the page in the world of a robot."""
+        """A point of the page in the world frame of a robot's env."""
         return tuple(float(v) for v in np.asarray(point) - self._offset[robot])
 
     def _add_surroundings(self) -> None:
@@ -169,5 +168,5 @@ class Scene:
 
 
 def _batched(values: np.ndarray) -> np.ndarray:
-    """(W, H, 3) as browsers take it, (W H, 3)."""
+    """(N, H, 3) as browsers take it, (N H, 3)."""
     return values.reshape(-1, 3).astype(np.float32)

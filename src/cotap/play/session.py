@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import json
+import contextlib
 from collections.abc import Mapping
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,24 +12,20 @@ import torch
 
 from cotap.agents.actors import as_dict
 from cotap.agents.checkpoint import require_layout, sha256
+from cotap.compliance.interface import Arms
 from cotap.compliance.laws import LAWS, LawConfig
-from cotap.envs import H1Env, H1EnvConfig
-from cotap.envs.commands import BRACE_TILT_RAD, STEADY_RAD
-from cotap.envs.reference import REST
+from cotap.envs import HumanoidEnv, HumanoidEnvConfig
+from cotap.envs.scripted_forces import ForceProfile
 from cotap.evaluation.policy import Policy, load_policy
-from cotap.evaluation.quiet import quiet
+from cotap.evaluation.rollout import reference_actions
+from cotap.evaluation.undisturbed import disable_disturbances
+from cotap.motions.reference import REST
 from cotap.play import ROBOTS
 from cotap.play.controls import AXES, Control, Ranges, make_controls
-from cotap.play.forces import HandLoads, Push
+from cotap.play.forces import HandForces, Push
 from cotap.play.sample import Sample, take_sample
 
-GAIT = (
-    "gait_period_s", "step_apart_m", "step_clear_m", "step_hold_back_m", "step_catch_lift",
-    "step_roll_damping_s", "step_twist_damping_s", "step_straighten_rad", "waist_yield_s", "waist_damping_s",
-    "step_timing", "step_correct_s", "foresee_falls",
-)  # fmt: skip
-"""Fields of `CommandConfig` that shape what is fed forward to legs and waist."""
-DOMAIN = ("friction", "mass_scale", "senses_loads")
+DOMAIN = ("friction", "mass_scale")
 """What is a robot's own from the start, beside its laws."""
 
 
@@ -51,7 +47,7 @@ class Session:
         self._checkpoints, self._seed = dict(checkpoints), seed
         first = next(iter(self._checkpoints))
         policy = load_policy(self._checkpoints[first])
-        self.env = H1Env(play_config(policy.env_config))
+        self.env = HumanoidEnv(play_config(policy.env_config))
         self._loaded: dict[str, Policy] = {}
         self._policies = [self._policy(first)] * len(ROBOTS)
         env = self.env
@@ -61,13 +57,12 @@ class Session:
         self.controls: dict[str, Control] = make_controls(
             Ranges(
                 c.velocity_x, c.velocity_y, c.yaw_rate, c.height_offset,
-                self.sides, tuple(LAWS), (REST, *clips), tuple(self._checkpoints),
-                policy.env_config.commands.lean_into_loads,
+                self.sides, usable_laws(env.upper_body.arms), (REST, *clips), tuple(self._checkpoints),
             )
         )  # fmt: skip
         self.values: dict[str, Any] = {name: control.default for name, control in self.controls.items()}
-        self.loads = HandLoads(len(ROBOTS), self.sides, env.dt)
-        env.scripted.active = True
+        self.hand_forces = HandForces(len(ROBOTS), self.sides, env.dt)
+        env.forces.scripted.active = True
         self.num_steps = 0
         self.falls = [0] * len(ROBOTS)
         self._apply_all()
@@ -78,14 +73,9 @@ class Session:
         """Control step [s]."""
         return self.env.dt
 
-    @property
-    def braces(self) -> list[bool]:
-        """Robots that stand, whatever they are told, since they brace themselves against loads."""
-        return self.env.load_sense.braces.tolist() if self.env.load_sense else [False] * len(ROBOTS)
-
     @torch.inference_mode()
     def set(self, values: Mapping[str, Any]) -> list[str]:
-        """Bring values, cleaned by their controls, into force. Returns what to tell people.
+        """Bring values, cleaned by their controls, into force. Returns notices to people.
 
         Values that cannot be brought into force, such as a checkpoint that does not fit, are put back.
         """
@@ -100,28 +90,19 @@ class Session:
         return notices
 
     def trained_otherwise(self, checkpoint: str) -> str:
-        """What to tell people about a checkpoint that runs under another gait than it was trained with; else empty.
-
-        The environment, and with it what is fed forward to the legs, is that of the first checkpoint.
-        """
-        trained = self._policy(checkpoint).env_config.commands
-        here = self.env.cfg.commands
-        differ = [
-            f"{name} {getattr(trained, name)} (here {getattr(here, name)})"
-            for name in GAIT
-            if getattr(trained, name) != getattr(here, name)
-        ]
-        return f"{checkpoint} was trained with {', '.join(differ)}" if differ else ""
+        """A notice if a checkpoint was trained with another stride than the first one, whose environment runs here."""
+        trained, here = self._policy(checkpoint).env_config.gait.period_s, self.env.cfg.gait.period_s
+        return f"{checkpoint} was trained with a stride of {trained:g} s; here it is {here:g} s" * (trained != here)
 
     def push(self, push: Push) -> None:
         """Push every robot's hand."""
-        self.loads.push(push)
+        self.hand_forces.push(push)
 
     @torch.inference_mode()
     def reset(self) -> None:
         """Put both robots on their feet in the same state; pushes end."""
-        self.loads.clear()
-        self._observations = self.env.reset_alike(self._seed)
+        self.hand_forces.clear()
+        self._observations = self.env.reset_identical(self._seed)
         self._face_forward(torch.ones(self.env.num_envs, dtype=torch.bool))
 
     @torch.inference_mode()
@@ -129,8 +110,8 @@ class Session:
         """Advance by one control step."""
         env = self.env
         s = env.state
-        force_h = self.loads.step(s.hand_pos_w, s.heading_w)
-        env.scripted.amplitude_h[:, :-1] = force_h
+        force_h = self.hand_forces.step(s.hand_pos_w, s.heading_w)
+        env.forces.scripted.amplitude_h[:, :-1] = force_h
         self._observations, _, done, extras = env.step(self._act())
         self.num_steps += 1
         laws = [[self.values[f"{robot}.{side}.law"] for side in self.sides] for robot in ROBOTS]
@@ -146,7 +127,7 @@ class Session:
         return {
             "robot": self.env.spec.name,
             "sides": list(self.sides),
-            "gait_period_s": self.env.cfg.commands.gait_period_s,
+            "gait_period_s": self.env.cfg.gait.period_s,
             "values": {name: value for name, value in self.values.items() if not name.endswith(".drag")},
             "checkpoints_sha256": {r: sha256(self._checkpoints[self.values[f"{r}.checkpoint"]]) for r in ROBOTS},
         }
@@ -158,7 +139,7 @@ class Session:
             actions = torch.cat((actions[:1], self._policies[1](observations)[1:]))
         if not self.values["arm_actions"]:
             actions = actions.clone()
-            actions[:, self.env.action_slices["upper"]] = 0.0
+            actions[:, self.env.action_slices["upper"]] = reference_actions(self.env)
         return actions
 
     def _policy(self, name: str) -> Policy:
@@ -166,7 +147,7 @@ class Session:
         if name not in self._loaded:
             path = self._checkpoints[name]
             policy = load_policy(path)
-            require_layout(path, policy.layout, json.loads(json.dumps(self.env.layout())))
+            require_layout(path, policy.layout, self.env.layout())
             self._loaded[name] = policy
         return self._loaded[name]
 
@@ -185,35 +166,32 @@ class Session:
         elif head == "held":
             side = rest[0]
             force = torch.tensor([self.values[f"held.{side}.{axis}"] for axis in AXES])
-            self.loads.held_h[self.sides.index(side)] = force
+            self.hand_forces.held_h[self.sides.index(side)] = force
         elif head == "motion":
             self.env.motions.lead(self.values["motion"])
         elif head in ("velocity_x", "velocity_y", "yaw_rate", "height_offset", "stand"):
             self._command()
 
-    def _apply_to_robot(self, world: int, rest: list[str]) -> None:
-        value = self.values[".".join((ROBOTS[world], *rest))]
+    def _apply_to_robot(self, robot: int, rest: list[str]) -> None:
+        value = self.values[".".join((ROBOTS[robot], *rest))]
         if rest[0] in self.sides:
             arm = self.sides.index(rest[0])
             if rest[1] == "drag":
-                self.loads.drag_w[world][arm] = value
+                self.hand_forces.drag_w[robot][arm] = value
             else:
-                self.env.set_law(world, arm, self._law(world, rest[0]))
+                self.env.set_law(robot, arm, self._law(robot, rest[0]))
         elif rest[0] == "checkpoint":
-            self._policies[world] = self._policy(value)
+            self._policies[robot] = self._policy(value)
         elif rest[0] == "friction":
-            mask = torch.arange(self.env.num_envs) == world
+            mask = torch.arange(self.env.num_envs) == robot
             self.env.randomizer.set_friction(mask, torch.tensor([value]))
-        elif rest[0] == "senses_loads":
-            assert self.env.load_sense is not None
-            self.env.load_sense.awake[world] = value
         else:
             self._set_mass()
 
-    def _law(self, world: int, side: str) -> LawConfig:
-        own = {n: self.values[f"{ROBOTS[world]}.{side}.{n}"] for n in ("null_stiffness", "alpha", "error", "damping")}
-        x, y, z = (self.values[f"{ROBOTS[world]}.{side}.stiffness_{axis}"] for axis in AXES)
-        return replace(LawConfig(self.values[f"{ROBOTS[world]}.{side}.law"], (x, y, z)), **own)
+    def _law(self, robot: int, side: str) -> LawConfig:
+        own = {n: self.values[f"{ROBOTS[robot]}.{side}.{n}"] for n in ("null_stiffness", "alpha", "error", "damping")}
+        x, y, z = (self.values[f"{ROBOTS[robot]}.{side}.stiffness_{axis}"] for axis in AXES)
+        return replace(LawConfig(self.values[f"{ROBOTS[robot]}.{side}.law"], (x, y, z)), **own)
 
     def _set_mass(self) -> None:
         scale = torch.tensor([self.values[f"{r}.mass_scale"] for r in ROBOTS])
@@ -230,26 +208,32 @@ class Session:
         self.env.commands.override(velocity, yaw_rate, torch.full((n,), float(stand)), height)
 
     def _face_forward(self, mask: torch.Tensor) -> None:
-        """Turn worlds that have just restarted along x. Nothing that is observed depends on it."""
+        """Turn robots that have just restarted along x. Nothing that is observed depends on it."""
         env = self.env
         env.sim.qpos[mask, 3:7] = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
         env.state = env.reader.read()
 
 
-def play_config(env: H1EnvConfig) -> H1EnvConfig:
-    """Turn the environment that a policy was trained in into the page's. Changes and returns `env`."""
-    quiet(env)
-    env.num_envs, env.num_threads, env.backend = len(ROBOTS), 1, "mjbatch"
-    env.terminations.episode_s = 1e6
-    env.commands.steady_rad = STEADY_RAD
-    # Who leans against loads is set robot by robot.
-    env.commands.lean_into_loads = True
-    env.commands.brace_tilt_rad = env.commands.brace_tilt_rad or BRACE_TILT_RAD
-    env.upper_body.sampling.enabled = False  # what the page sets stays
-    env.motions.clips.share, env.motions.clips.only, env.motions.clips.held_out = 1.0, (), ()
-    for weights in (env.rewards.lower, env.rewards.upper):  # nobody learns here; a group must have one term
-        for term in fields(weights):
-            if term.name != "alive":
-                setattr(weights, term.name, 0.0)
-    env.force.force, env.force.start_s, env.force.duration_s = (0.0, 0.0, 0.0), 0.0, 1e6
-    return env
+def usable_laws(arms: Arms) -> tuple[str, ...]:
+    """The laws that these arms can be under: some ask for arms of a kind."""
+    names = []
+    for name, law in LAWS.items():
+        with contextlib.suppress(ValueError):
+            law(arms, LawConfig(name))
+            names.append(name)
+    return tuple(names)
+
+
+def play_config(env_cfg: HumanoidEnvConfig) -> HumanoidEnvConfig:
+    """Turn the environment that a policy was trained in into the page's. Changes and returns `env_cfg`."""
+    disable_disturbances(env_cfg)
+    env_cfg.num_envs, env_cfg.num_threads, env_cfg.backend = len(ROBOTS), 1, "mjbatch"
+    env_cfg.terminations.episode_s = 1e6
+    env_cfg.upper_body.sampling.enabled = False  # what the page sets stays
+    env_cfg.motions.clips.share, env_cfg.motions.clips.only, env_cfg.motions.clips.held_out = 1.0, (), ()
+    for weights in (env_cfg.rewards.lower, env_cfg.rewards.upper):  # nobody learns here; a group must have one term
+        for name in vars(weights):
+            if name != "alive":
+                setattr(weights, name, 0.0)
+    env_cfg.forces.scripted = ForceProfile(start_s=0.0)
+    return env_cfg

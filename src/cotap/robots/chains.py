@@ -15,12 +15,11 @@ def chains_between(
     spec: RobotSpec, root: str, tips: list[tuple[str, tuple[float, float, float]]], dtype: torch.dtype = torch.float32
 ) -> SerialChains:
     """Kinematic chains from body `root` to points (body, point in its frame), all of equal length."""
-    joint_axes = {j.name: j.axis for j in spec.joints}
     chains = [spec.chain(body, root) for body, _ in tips]
     return SerialChains(
         torch.tensor([[b.pos for b in chain] for chain in chains], dtype=dtype),
         torch.tensor([[b.quat for b in chain] for chain in chains], dtype=dtype),
-        torch.tensor([[joint_axes[b.joint or ""] for b in chain] for chain in chains], dtype=dtype),
+        torch.tensor([[spec.joint(b.joint or "").axis for b in chain] for chain in chains], dtype=dtype),
         torch.tensor([point for _, point in tips], dtype=dtype),
     )
 
@@ -33,20 +32,22 @@ def arm_chains(spec: RobotSpec, dtype: torch.dtype = torch.float32) -> SerialCha
 def arm_inertias(spec: RobotSpec, dtype: torch.dtype = torch.float32) -> LinkInertias:
     """Nominal masses of the arms' links, arm by arm."""
     chains = [spec.chain(arm.hand_body, spec.torso_body) for arm in spec.arms]
+    armature = [[spec.joint(b.joint or "").armature_kg_m2 for b in chain] for chain in chains]
     frames = matrix_from_quat(torch.tensor([[b.inertia_quat for b in chain] for chain in chains], dtype=dtype))
     principal = torch.diag_embed(torch.tensor([[b.diaginertia for b in chain] for chain in chains], dtype=dtype))
     return LinkInertias(
         torch.tensor([[b.mass_kg for b in chain] for chain in chains], dtype=dtype),
         torch.tensor([[b.com for b in chain] for chain in chains], dtype=dtype),
         frames @ principal @ frames.transpose(-1, -2),
-        spec.joint_armature,
+        torch.tensor(armature, dtype=dtype),
     )
 
 
 def arm_model(spec: RobotSpec, dtype: torch.dtype = torch.float32) -> Arms:
     """All that laws may know of the arms: nominal kinematics, masses, gains and limits."""
-    joints = [[spec.joints[i] for i in spec.indices(arm.joints)] for arm in spec.arms]
-    kp, kd, low, high, speed = torch.tensor(
-        [[(j.kp, j.kd, *j.range_rad, j.velocity_limit_rad_s) for j in arm] for arm in joints], dtype=dtype
+    joints = [[spec.joint(name) for name in arm.joints] for arm in spec.arms]
+    kp, kd, low, high, speed, friction = torch.tensor(
+        [[(j.kp, j.kd, *j.range_rad, j.velocity_limit_rad_s, j.damping_nms_rad) for j in arm] for arm in joints],
+        dtype=dtype,
     ).unbind(-1)
-    return Arms(arm_chains(spec, dtype), arm_inertias(spec, dtype), kp, kd, low, high, speed, spec.joint_damping)
+    return Arms(arm_chains(spec, dtype), arm_inertias(spec, dtype), kp, kd, low, high, speed, friction)

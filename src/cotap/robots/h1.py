@@ -1,4 +1,4 @@
-"""Unitree H1: 19 hinges, from the published parameters in h1_facts.json."""
+"""Unitree H1: 19 hinges, from the published parameters in facts/h1.json."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from functools import lru_cache
 from importlib.resources import files
 from typing import Any
 
-from cotap.robots.spec import ArmSpec, BodySpec, FootSpec, GeomSpec, JointSpec, RobotSpec, StanceGain, StanceSpec
+from cotap.robots.spec import ArmSpec, BodySpec, FootSpec, GeomSpec, JointSpec, RobotSpec
 
 # kp [Nm/rad], kd [Nms/rad], default angle [rad], velocity limit [rad/s]; Unitree's gains. The default pose of the legs
 # has the centre of mass over the middle of the soles.
@@ -92,30 +92,7 @@ def _visuals(body: str) -> tuple[GeomSpec, ...]:
     return shapes[part]
 
 
-# Found by scripts/tune_stance.py. Rows: hip pitch, knee, ankle; columns: tilt, three angles, tilt rate, three rates.
-_STANCE_GAINS = (
-    StanceGain(
-        0.0,
-        (
-            (0.285, 0.116, -0.123, 0.264, 0.096, -0.045, -0.029, 0.028),
-            (0.54, -0.003, -0.264, -0.352, 0.096, -0.034, -0.039, -0.027),
-            (5.239, 0.575, -1.649, -6.15, 0.821, -0.003, -0.293, -0.617),
-        ),
-        (-0.027, -0.011, -0.042),
-    ),
-    StanceGain(
-        -0.2,
-        (
-            (0.308, -0.216, -0.458, 0.336, 0.121, -0.061, -0.019, 0.037),
-            (0.562, -0.088, -0.657, -0.564, 0.221, -0.031, -0.036, -0.019),
-            (4.659, -0.119, -1.84, -7.82, 0.954, 0.06, -0.335, -0.658),
-        ),
-        (0.008, -0.132, -0.246),
-    ),
-)
-
-
-def _joint(entry: dict[str, Any]) -> JointSpec:
+def _joint(entry: dict[str, Any], armature: float, damping: float) -> JointSpec:
     name: str = entry["name"]
     part = name.removeprefix("left_").removeprefix("right_")
     kp, kd, default, velocity = _JOINTS[part]
@@ -126,8 +103,9 @@ def _joint(entry: dict[str, Any]) -> JointSpec:
     sign = 1.0 if entry["axis"] == [0.0, 1.0, 0.0] else -1.0
     low, high = entry["range_rad"]
     return JointSpec(
-        name, tuple(entry["axis"]), (low, high), entry["torque_limit_nm"], velocity, kp, kd, default, mirror, sign
-    )
+        name, tuple(entry["axis"]), (low, high), entry["torque_limit_nm"], velocity, kp, kd, armature, damping, default,
+        mirror, sign,
+    )  # fmt: skip
 
 
 def _body(entry: dict[str, Any]) -> BodySpec:
@@ -144,8 +122,9 @@ def _body(entry: dict[str, Any]) -> BodySpec:
 @lru_cache(maxsize=1)
 def h1() -> RobotSpec:
     """The Unitree H1. At zero arm angles the upper arms hang and the forearms point forward."""
-    facts = json.loads(files("cotap.robots").joinpath("h1_facts.json").read_text(encoding="utf-8"))
-    joints = tuple(_joint(b["joint"]) for b in facts["bodies"] if b["joint"]["type"] == "hinge")
+    facts = json.loads(files("cotap.robots").joinpath("facts/h1.json").read_text(encoding="utf-8"))
+    passive = facts["joint_armature"], facts["joint_damping"]
+    joints = tuple(_joint(b["joint"], *passive) for b in facts["bodies"] if b["joint"]["type"] == "hinge")
     sides = ("left", "right")
     return RobotSpec(
         name="h1",
@@ -157,22 +136,8 @@ def h1() -> RobotSpec:
             ArmSpec(s, tuple(f"{s}_{j}" for j in _ARM), f"{s}_elbow_link", (0.3, 0.0, 0.0), f"{s}_elbow_link")
             for s in sides
         ),
-        feet=tuple(
-            FootSpec(
-                s,
-                f"{s}_ankle_link",
-                (0.05, 0.0, -0.07),
-                ((f"{s}_hip_pitch", -0.35), (f"{s}_knee", 0.7), (f"{s}_ankle", -0.35)),
-            )
-            for s in sides
-        ),
-        stance=StanceSpec(tuple((f"{s}_hip_pitch", f"{s}_knee", f"{s}_ankle") for s in sides), _STANCE_GAINS),
-        joint_damping=facts["joint_damping"],
-        joint_armature=facts["joint_armature"],
+        feet=tuple(FootSpec(s, f"{s}_ankle_link", (0.05, 0.0, -0.07)) for s in sides),
         nominal_height_m=1.0205,
-        # Hips are at -0.18 m, 0.20 m out; thighs and forearms are 0.03 to 0.06 m thick, and hips roll.
-        legs_below_m=-0.03,
-        legs_within_m=0.33,
         menagerie="unitree_h1",
         colors=_COLORS,
     )

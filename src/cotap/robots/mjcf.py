@@ -35,7 +35,8 @@ def build_model(
 
     Args:
         spec: The robot.
-        collision: "feet" (feet against the floor) or "full" (all shapes, against the floor and each other).
+        collision: "feet" (feet against the floor) or "full" (all shapes, against the floor and each other,
+            but for the pairs that the robot excludes).
         timestep_s: Physics step [s].
         fixed_base: Hold the base in the air, `FIXED_BASE_LIFT_M` above where it stands.
         unevenness_m: Height of the ground's bumps from lowest to highest, about a height of zero; 0 is flat.
@@ -60,12 +61,15 @@ def build_mjspec(spec: RobotSpec, collision: str = "feet", timestep_s: float = 0
     mj.compiler.degree = False
     mj.option.timestep = timestep_s
     mj.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    # MuJoCo would silently restart a world whose state is not finite; cotap ends its episode and counts it instead.
+    # MuJoCo would silently restart an env whose state is not finite; cotap ends its episode and counts it instead.
     mj.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET.value
     _add_scene(mj)
     bodies: dict[str, mujoco.MjsBody] = {"world": mj.worldbody}
     for body in spec.bodies:
         bodies[body.name] = _add_body(bodies[body.parent], body, spec, collision)
+    if collision == "full":
+        for first, second in spec.contact_excludes:
+            mj.add_exclude(bodyname1=first, bodyname2=second)
     _add_sites_and_sensors(mj, bodies, spec)
     for joint in spec.joints:
         actuator = mj.add_actuator(name=joint.name, target=joint.name)
@@ -82,7 +86,7 @@ def hold_base(mj: mujoco.MjSpec, spec: RobotSpec) -> None:
     """Weld the base to the world; stiffly, since what hangs from it is measured to a tenth of a millimetre."""
     weld = mj.add_equality(name="fixed_base", type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY)
     weld.name1, weld.name2 = spec.base_body, "world"
-    weld.data[:] = [0.0, 0.0, 0.0, 0.0, 0.0, -(spec.nominal_height_m + FIXED_BASE_LIFT_M), 1.0, 0.0, 0.0, 0.0, 1.0]
+    weld.data[:] = [0.0, 0.0, 0.0, 0.0, 0.0, -(spec.base_height_m + FIXED_BASE_LIFT_M), 1.0, 0.0, 0.0, 0.0, 1.0]
     weld.solimp[:3] = 0.9999, 0.9999, 0.001
 
 
@@ -138,11 +142,11 @@ def _add_body(parent: mujoco.MjsBody, body: BodySpec, spec: RobotSpec, collision
             xyaxes=[0.84, 0.54, 0.0, -0.08, 0.13, 0.99],
         )  # fmt: skip
     else:
-        joint = spec.joints[spec.indices([body.joint])[0]]
+        joint = spec.joint(body.joint)
         hinge = out.add_joint(name=joint.name, axis=joint.axis, range=joint.range_rad)
         hinge.limited = mujoco.mjtLimited.mjLIMITED_TRUE
-        hinge.damping = [spec.joint_damping, 0.0, 0.0]
-        hinge.armature = spec.joint_armature
+        hinge.damping = [joint.damping_nms_rad, 0.0, 0.0]
+        hinge.armature = joint.armature_kg_m2
     feet = {f.body for f in spec.feet}
     for geom in body.visual:
         _add_geom(out, geom, spec, _VISUAL_GROUP)
@@ -154,7 +158,7 @@ def _add_body(parent: mujoco.MjsBody, body: BodySpec, spec: RobotSpec, collision
         shape.contype, shape.conaffinity = _PART, _FLOOR | (_PART if collision == "full" else 0)
         shape.condim = 3
         if body.name in feet:
-            shape.priority = 1  # the foot's friction is the contact's, so that it can differ between worlds
+            shape.priority = 1  # the foot's friction is the contact's, so that it can differ between envs
     return out
 
 

@@ -4,6 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import zip_longest
+
+import numpy as np
+
+from cotap.robots.kinematics import body_frame, default_angles
 
 Vec3 = tuple[float, float, float]
 Quat = tuple[float, float, float, float]
@@ -33,10 +38,15 @@ class JointSpec:
     """Position gain [Nm/rad]."""
     kd: float
     """Damping gain [Nms/rad]."""
+    armature_kg_m2: float
+    """Rotor inertia as the joint feels it, gears included."""
+    damping_nms_rad: float
+    """Viscous friction, beside what the motor damps."""
     default_rad: float
     mirror_name: str
     """The joint it becomes when the robot is reflected in its sagittal plane."""
     mirror_sign: float
+    """What its angle is multiplied by then."""
 
 
 @dataclass(frozen=True)
@@ -72,42 +82,24 @@ class ArmSpec:
 
 @dataclass(frozen=True)
 class FootSpec:
-    """A foot: the body that touches the ground, the centre of its sole, and how its leg lifts it."""
+    """A foot: the body that touches the ground, and the centre of its sole."""
 
     side: str
     body: str
     sole: Vec3
     """In `body`'s frame [m]."""
-    flexion: tuple[tuple[str, float], ...]
-    """Joints and angles [rad], relative to the default pose, that lift the sole straight up by a step's height."""
-
-
-@dataclass(frozen=True)
-class StanceGain:
-    """Linear feedback that balances a robot on both feet, fore and aft, at one height."""
-
-    height_offset_m: float
-    """Torso height relative to nominal."""
-    gain: tuple[tuple[float, ...], ...]
-    """Per joint, what its target moves by per radian of forward tilt, per radian of each joint's error (mean of all
-    legs), and per rad/s of the same: 2 (1 + n) numbers."""
-    bias: tuple[float, ...]
-    """Per joint, what its target moves by always [rad]."""
-
-
-@dataclass(frozen=True)
-class StanceSpec:
-    """What a robot needs to stand, for its PD gains (see `cotap.envs.stance`)."""
-
-    joints: tuple[tuple[str, ...], ...]
-    """Per leg, the joints that pitch, from the hip down."""
-    gains: tuple[StanceGain, StanceGain]
-    """At nominal height and at a low one."""
 
 
 @dataclass(frozen=True)
 class RobotSpec:
-    """A floating-base robot. `joints` is in actuator order: the lower agent's first, then the upper's."""
+    """A floating-base robot.
+
+    `joints` is in actuator order: the lower agent's first, then the upper's. It is also the order in which MuJoCo
+    visits the bodies, depth first, so that `qpos[7:]` is joint by joint the same.
+
+    Raises:
+        ValueError: joints are out of order, a name is unknown, mirrors disagree, or arms differ in length.
+    """
 
     name: str
     bodies: tuple[BodySpec, ...]
@@ -116,15 +108,10 @@ class RobotSpec:
     torso_body: str
     arms: tuple[ArmSpec, ...]
     feet: tuple[FootSpec, ...]
-    stance: StanceSpec
-    joint_damping: float
-    joint_armature: float
     nominal_height_m: float
     """Height of the torso link above flat ground in the default pose."""
-    legs_below_m: float
-    """The legs' top in the torso link's frame, as far as hands are concerned."""
-    legs_within_m: float
-    """How far to either side of the middle a low hand may meet them."""
+    contact_excludes: tuple[tuple[str, str], ...] = ()
+    """Pairs of bodies that never collide."""
     menagerie: str = ""
     """The robot's name in MuJoCo Menagerie, for those who have its meshes."""
     colors: dict[str, tuple[float, float, float]] = field(default_factory=dict)
@@ -143,12 +130,30 @@ class RobotSpec:
         """Every other joint: legs and waist."""
         return tuple(n for n in self.joint_names if n not in self.upper_joints)
 
+    @cached_property
+    def mass_kg(self) -> float:
+        """Of all bodies."""
+        return sum(b.mass_kg for b in self.bodies)
+
+    @cached_property
+    def base_height_m(self) -> float:
+        """Height of the base above flat ground in the default pose, the base level."""
+        torso, _ = body_frame(self, self.torso_body, self.base_body, default_angles(self))
+        return self.nominal_height_m - float(torso[2])
+
+    @cached_property
+    def sole_distance_m(self) -> float:
+        """Lateral distance between the first two soles in the default pose."""
+        first, second = (self._sole(foot) for foot in self.feet[:2])
+        return abs(float(first[1] - second[1]))
+
     def __post_init__(self) -> None:
-        if self.joint_names != self.lower_joints + self.upper_joints:
-            raise ValueError(f"{self.name}: joints must be ordered lower body first, then the arms in order")
-        for j in self.joints:
-            if j.mirror_name not in self.joint_names:
-                raise ValueError(f"{self.name}: mirror of {j.name} is unknown: {j.mirror_name!r}")
+        self._check_order()
+        self._check_mirrors()
+        self._check_bodies()
+        lengths = {arm.side: len(arm.joints) for arm in self.arms}
+        if len(set(lengths.values())) > 1:
+            raise ValueError(f"{self.name}: arms must have equally many joints, got {lengths}")
 
     def indices(self, names: tuple[str, ...] | list[str]) -> list[int]:
         """Positions of `names` among `joints`. Raises ValueError for an unknown name, listing all."""
@@ -156,6 +161,10 @@ class RobotSpec:
         if missing:
             raise ValueError(f"{self.name} has no joint {missing[0]!r}; joints: {', '.join(self.joint_names)}")
         return [self.joint_names.index(n) for n in names]
+
+    def joint(self, name: str) -> JointSpec:
+        """The joint called `name`. Raises ValueError listing all joints."""
+        return self.joints[self.indices([name])[0]]
 
     def body(self, name: str) -> BodySpec:
         """The body called `name`. Raises ValueError listing all bodies."""
@@ -174,3 +183,37 @@ class RobotSpec:
                 raise ValueError(f"{self.name}: {tip!r} is not below {root!r}")
             body = self.body(body.parent)
         return tuple(reversed(out))
+
+    def _sole(self, foot: FootSpec) -> np.ndarray:
+        """Centre of a sole (3,) in the base's frame in the default pose [m]."""
+        position, rotation = body_frame(self, foot.body, self.base_body, default_angles(self))
+        return position + rotation @ foot.sole
+
+    def _check_order(self) -> None:
+        if self.joint_names != self.lower_joints + self.upper_joints:
+            raise ValueError(f"{self.name}: joints must be ordered lower body first, then the arms in order")
+        visited = [b.joint for b in self._depth_first("world") if b.joint is not None]
+        for have, want in zip_longest(self.joint_names, visited):
+            if have != want:
+                raise ValueError(
+                    f"{self.name}: joint {have!r} is out of order, {want!r} is next: joints must follow the bodies, "
+                    "depth first"
+                )
+
+    def _depth_first(self, parent: str) -> list[BodySpec]:
+        """Bodies below `parent` as MuJoCo visits them."""
+        children = [b for b in self.bodies if b.parent == parent]
+        return [body for child in children for body in (child, *self._depth_first(child.name))]
+
+    def _check_mirrors(self) -> None:
+        for j in self.joints:
+            if j.mirror_name not in self.joint_names:
+                raise ValueError(f"{self.name}: mirror of {j.name} is unknown: {j.mirror_name!r}")
+            mirror = self.joint(j.mirror_name)
+            if (mirror.mirror_name, mirror.mirror_sign) != (j.name, j.mirror_sign):
+                raise ValueError(f"{self.name}: {j.name} and {mirror.name} are not each other's mirror with one sign")
+
+    def _check_bodies(self) -> None:
+        ends = [body for arm in self.arms for body in (arm.hand_body, arm.elbow_body)] + [f.body for f in self.feet]
+        for name in (self.base_body, self.torso_body, *ends, *(n for pair in self.contact_excludes for n in pair)):
+            self.body(name)

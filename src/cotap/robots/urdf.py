@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable
 from xml.etree import ElementTree as ET
 
@@ -39,8 +40,10 @@ def _numbers(values: Iterable[float]) -> str:
 
 
 def _origin(parent: ET.Element, position: Iterable[float], orientation: Rotation) -> None:
-    # Lower case: about fixed axes, as URDF has roll, pitch and yaw.
-    ET.SubElement(parent, "origin", xyz=_numbers(position), rpy=_numbers(orientation.as_euler("xyz")))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # at a pitch of 90 degrees many angles mean the same
+        angles = orientation.as_euler("xyz")  # lower case: about fixed axes, as URDF has roll, pitch and yaw
+    ET.SubElement(parent, "origin", xyz=_numbers(position), rpy=_numbers(angles))
 
 
 def _add_link(root: ET.Element, body: BodySpec) -> None:
@@ -75,7 +78,7 @@ def _shapes(body: BodySpec, geom: GeomSpec) -> list[tuple[str, dict[str, str], f
 
 
 def _add_joint(root: ET.Element, body: BodySpec, spec: RobotSpec) -> None:
-    hinge = spec.joints[spec.indices([body.joint or ""])[0]]
+    hinge = spec.joint(body.joint or "")
     joint = ET.SubElement(root, "joint", name=hinge.name, type="revolute")
     ET.SubElement(joint, "parent", link=body.parent)
     ET.SubElement(joint, "child", link=body.name)
@@ -84,4 +87,4 @@ def _add_joint(root: ET.Element, body: BodySpec, spec: RobotSpec) -> None:
     (low, high), limits = hinge.range_rad, (hinge.torque_limit_nm, hinge.velocity_limit_rad_s)
     lower, upper, effort, velocity = (_numbers([v]) for v in (low, high, *limits))
     ET.SubElement(joint, "limit", lower=lower, upper=upper, effort=effort, velocity=velocity)
-    ET.SubElement(joint, "dynamics", damping=_numbers([spec.joint_damping]), friction="0")
+    ET.SubElement(joint, "dynamics", damping=_numbers([hinge.damping_nms_rad]), friction="0")

@@ -1,6 +1,5 @@
 """Batched physics: stepping, per-world model fields, wrenches, snapshots; knows nothing of control laws."""
 
-from cotap.sim.actuation import DelayedTargets
 from cotap.sim.backends import BACKENDS, make_simulation, resolve_backend
 from cotap.sim.batch_simulation import BatchSimulation
 from cotap.sim.simulation import Simulation, Snapshot
@@ -8,7 +7,6 @@ from cotap.sim.simulation import Simulation, Snapshot
 __all__ = [
     "BACKENDS",
     "BatchSimulation",
-    "DelayedTargets",
     "Simulation",
     "Snapshot",
     "make_simulation",

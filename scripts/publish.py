@@ -1,0 +1,103 @@
+"""Make a run's checkpoint a policy that the package ships: its weights, where they come from, and its evaluations.
+
+python scripts/publish.py runs/base/checkpoint_006104.pt h1-base
+
+Writes NAME.pt, NAME.json and one NAME.EVALUATION.json for each of `EVALUATIONS`. No number of the policy changes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from cotap.agents.checkpoint import load_checkpoint, require_parts, save_checkpoint, sha256, write_json
+from cotap.checks import require_positive_int
+from cotap.evaluate import main as evaluate
+from cotap.evaluation.policy import CHECKPOINTS, checkpoint_path, find_checkpoint
+
+TRACKING, ENVS = "velocity-tracking", "ENVS"
+HELD_OUT = ("dance_b", "dance_b_mirrored", "kick", "kick_mirrored")
+EVALUATIONS: dict[str, list[str]] = {
+    TRACKING: [TRACKING, "--num-envs", ENVS],
+    f"{TRACKING}.hand-loads": [TRACKING, "--num-envs", ENVS, "--hand-loads"],
+    f"{TRACKING}.held-out": [TRACKING, "--num-envs", ENVS, "--motion", *HELD_OUT],
+    f"{TRACKING}.small": [TRACKING, "--num-envs", "64", "--episode-seconds", "10", "--threads", "1"],
+}
+"""By name; a test repeats the small one. ENVS stands for `--envs`."""
+KEPT = ("kind", "layout", "agents", "config", "model", "iteration", "samples", "wall_seconds")
+"""Parts of the run's checkpoint that are shipped."""
+EMPTY: dict[str, Any] = {"learner": {}, "env": {}, "others": []}
+HEADLINE = ("num_envs", "num_falls", "e_lin", "e_yaw", "slopes")
+
+
+def strip(source: Path, target: Path) -> dict[str, Any]:
+    """Save what is shipped of a checkpoint. Returns its content."""
+    content = load_checkpoint(source)
+    require_parts(source, content, KEPT)
+    kept = {name: content[name] for name in KEPT}
+    kept["config"] = without_folder(kept["config"], f"{Path.cwd()}/")
+    target.parent.mkdir(exist_ok=True)
+    save_checkpoint(target, kept | EMPTY)
+    return kept
+
+
+def without_folder(value: Any, folder: str) -> Any:
+    """Plain data without the folder in its paths, which no other machine has."""
+    return json.loads(json.dumps(value).replace(json.dumps(folder)[1:-1], ""))
+
+
+def description(target: Path, content: dict[str, Any], headlines: dict[str, Any]) -> dict[str, Any]:
+    """What NAME.json says."""
+    config = content["config"]
+    runs = [*config.get("earlier_runs", []), {key: config[key] for key in ("command", "commit")}]
+    return {
+        "sha256": sha256(target),
+        "robot": content["layout"]["robot"],
+        "stage": content["kind"],
+        "runs": runs,
+        "command": config["command"],
+        "commit": config["commit"],
+        "seed": config["training"]["seed"],
+        "iterations": content["iteration"],
+        "samples": content["samples"],
+        "hours": round(content["wall_seconds"] / 3600.0, 2),
+        "machine": config["machine"],
+        "evaluations": headlines,
+    }
+
+
+def publish(source: Path, name: str, envs: int) -> int:
+    """Write everything. Returns the exit status: 0, or that of the evaluation that failed."""
+    target = checkpoint_path(name)
+    content = strip(source, target)
+    headlines: dict[str, Any] = {}
+    for evaluation, options in EVALUATIONS.items():
+        out = target.with_name(f"{name}.{evaluation}.json")
+        args = [str(envs) if option == ENVS else option for option in options]
+        if status := evaluate([*args, "--checkpoint", str(target), "--json", str(out)]):
+            return status
+        result = json.loads(out.read_text())
+        headlines[evaluation] = {key: result[key] for key in HEADLINE}
+    write_json(target.with_suffix(".json"), description(target, content, headlines))
+    return 0
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Parse and publish. Returns the exit status: 0, or 2 for bad input."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("checkpoint", type=find_checkpoint)
+    parser.add_argument("name", choices=CHECKPOINTS)
+    parser.add_argument("--envs", type=int, default=1024, help="of the large evaluations")
+    options = parser.parse_args(argv)
+    try:
+        return publish(options.checkpoint, options.name, require_positive_int("envs", options.envs))
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

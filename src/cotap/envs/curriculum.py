@@ -1,0 +1,107 @@
+"""What changes as training goes on, by samples: disturbances grow, and the wrench that assists first steps fades."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from cotap.checks import require_range
+from cotap.envs.commands import Command
+from cotap.envs.state import RobotState
+from cotap.robots import RobotSpec
+from cotap.rotations import rotate
+
+GRAVITY = 9.81
+
+
+@dataclass
+class RampConfig:
+    """A share that grows linearly from 0 to 1 with the samples (control steps of all envs)."""
+
+    start_samples: float = 0.0
+    """Samples up to which it is `first`."""
+    full_samples: float = 0.0
+    """Samples from which it is 1."""
+    first: float = 0.0
+    """Where it begins."""
+
+    def check(self, where: str) -> None:
+        """Raise ValueError naming the first field, under `where`, that is out of its range."""
+        require_range(f"{where}.full_samples", self.full_samples, 0.0, 1e15)
+        require_range(f"{where}.start_samples", self.start_samples, 0.0, self.full_samples)
+        require_range(f"{where}.first", self.first, 0.0, 1.0)
+
+    def share(self, samples: float) -> float:
+        """The share after so many samples."""
+        if samples >= self.full_samples:
+            return 1.0
+        progress = (samples - self.start_samples) / (self.full_samples - self.start_samples)
+        return self.first + (1.0 - self.first) * max(0.0, progress)
+
+
+@dataclass
+class AssistConfig:
+    """A wrench on the torso that carries the robot through its first steps and fades linearly.
+
+    Without it, standing still is a local optimum that plain reward tables do not leave. Gains are in units of the
+    robot's weight, so that they fit any robot.
+    """
+
+    enabled: bool = False
+    """Whether to assist; training switches it on."""
+    full_samples: float = 2e6
+    """Samples with full assistance."""
+    end_samples: float = 30e6
+    """Samples after which there is none."""
+    upright_stiffness: float = 0.8
+    """Righting torque per radian of tilt, over weight times nominal height [1/rad]."""
+    upright_damping: float = 0.08
+    """The same per rad/s [s/rad]."""
+    yaw_gain: float = 0.06
+    """Turning torque per rad/s that the yaw rate is off its command, over weight times nominal height [s/rad]."""
+    velocity_gain: float = 0.6
+    """Horizontal pull per m/s that the velocity is off its command, over weight [s/m]."""
+    force_limit: float = 0.3
+    """Largest pull, over weight."""
+    weight_share: float = 0.25
+    """Share of the weight that is lifted."""
+    height_stiffness: float = 4.0
+    """Lift per metre that the torso is below its commanded height, over weight [1/m]."""
+    height_damping: float = 0.4
+    """The same per m/s [s/m]."""
+
+    def check(self) -> None:
+        """Raise ValueError naming the first field that is out of its range."""
+        require_range("assist.full_samples", self.full_samples, 0.0, 1e15)
+        require_range("assist.end_samples", self.end_samples, self.full_samples, 1e15)
+        require_range("assist.weight_share", self.weight_share, 0.0, 1.0)
+        for name in (
+            "upright_stiffness", "upright_damping", "yaw_gain", "velocity_gain", "force_limit", "height_stiffness",
+            "height_damping",
+        ):  # fmt: skip
+            require_range(f"assist.{name}", getattr(self, name), 0.0, 100.0)
+
+    def share(self, samples: float) -> float:
+        """Share of the assistance that is left after so many samples."""
+        if not self.enabled or samples >= self.end_samples:
+            return 0.0
+        return min(1.0, (self.end_samples - samples) / max(self.end_samples - self.full_samples, 1.0))
+
+
+def assist_wrench(cfg: AssistConfig, spec: RobotSpec, s: RobotState, command: Command) -> torch.Tensor:
+    """Force [N] and torque [Nm] on the torso, (N, 6) in the world frame, at full assistance."""
+    weight = spec.mass_kg * GRAVITY
+    lever = weight * spec.nominal_height_m
+    up_w = s.torso_rotation_w[:, :, 2]
+    vertical = torch.tensor([0.0, 0.0, 1.0], device=up_w.device).expand_as(up_w)
+    tilting_w = rotate(s.torso_rotation_w, s.torso_angular_velocity_t) * torch.tensor([1.0, 1.0, 0.0]).to(up_w)
+    torque = cfg.upright_stiffness * torch.linalg.cross(up_w, vertical) - cfg.upright_damping * tilting_w
+    torque = lever * (torque + cfg.yaw_gain * (command.yaw_rate - s.yaw_rate).unsqueeze(1) * vertical)
+    error_h = torch.nn.functional.pad(command.velocity_h - s.torso_linear_velocity_h[:, :2], (0, 1))
+    pull = cfg.velocity_gain * rotate(s.heading_w, error_h)
+    pull = pull * (cfg.force_limit / pull.norm(dim=1, keepdim=True).clamp_min(1e-6)).clamp_max(1.0)
+    # Like a gantry: it lifts, and never pushes down.
+    spring = cfg.height_stiffness * (command.height - s.height)
+    lift = cfg.weight_share + spring - cfg.height_damping * s.torso_linear_velocity_h[:, 2]
+    return torch.cat((weight * (pull + lift.clamp(0.0, 1.0).unsqueeze(1) * vertical), torque), 1)

@@ -1,0 +1,159 @@
+"""What a protocol is: the environment that it needs, what it runs there, what it measures and shows."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+
+from cotap.checks import require_one_of, require_positive_int, require_range, require_seed
+from cotap.envs import HumanoidEnv, HumanoidEnvConfig
+from cotap.envs.terminations import TerminationConfig
+from cotap.evaluation import report
+from cotap.evaluation.law_options import LawOptions
+from cotap.evaluation.rollout import UPPER_ACTIONS, PolicyFunction, Trajectory, acting, record_rollout
+from cotap.evaluation.undisturbed import disable_disturbances
+from cotap.motions.reference import ClipConfig
+
+MIXTURE, HELD = "mixture", "none"
+"""In place of a clip's name: the mixture that the policy was trained on, and a pose that is held."""
+
+
+@dataclass
+class Protocol(ABC):
+    """Options that all protocols have."""
+
+    laws: ClassVar[LawOptions] = LawOptions()
+    """Laws of the arms unless the command line names others."""
+
+    num_envs: int = 1024
+    """Number of envs."""
+    seed: int = 0
+    """Seed of envs and of all that is drawn."""
+    torque_limit_scale: float = 1.0
+    """Factor on the robot's torque limits."""
+
+    def check(self) -> None:
+        """Raise ValueError naming the first field that is out of its range."""
+        require_positive_int("num_envs", self.num_envs)
+        require_seed("seed", self.seed)
+        require_range("torque_limit_scale", self.torque_limit_scale, 1e-3, 1e3)
+
+    @property
+    def arms(self) -> str:
+        """Whether the arms' reference moves: moving or held."""
+        return "held"
+
+    def configure(self, env_cfg: HumanoidEnvConfig) -> HumanoidEnvConfig:
+        """Turn the environment that a policy was trained in into this protocol's. Changes and returns `env_cfg`."""
+        self.check()
+        disable_disturbances(env_cfg)
+        env_cfg.num_envs, env_cfg.seed, env_cfg.torque_limit_scale = self.num_envs, self.seed, self.torque_limit_scale
+        env_cfg.terminations = TerminationConfig(episode_s=1e6)  # what ends an episode is a fall
+        return env_cfg
+
+    def prepare(self, env: HumanoidEnv) -> None:  # noqa: B027  (some have nothing to prepare)
+        """Set up an environment that was made from the config."""
+
+    @abstractmethod
+    def evaluate(self, env: HumanoidEnv, policy: PolicyFunction) -> dict[str, Any]:
+        """Run in an environment that is prepared. Returns the measured part of the JSON."""
+
+    def table(self, result: dict[str, Any]) -> str:
+        """The result as Markdown."""
+        return report.table(result)
+
+    @abstractmethod
+    def plot(self, path: Path, result: dict[str, Any]) -> None:
+        """Draw the result, as a PNG file."""
+
+
+@dataclass
+class RolloutProtocol(Protocol):
+    """A protocol that measures what it recorded of one rollout, in which arms may move."""
+
+    motion: tuple[str, ...] = (MIXTURE,)
+    """Clips that the arms follow, `mixture` for what the policy was trained on, or `none` for a pose that is held."""
+    library: str = ""
+    """Motion library (.npz) that clips are taken from; empty keeps the policy's."""
+    upper_actions: str = "policy"
+    """What moves the arms: policy, or reference for the raw reference in place of the policy's upper actions."""
+    randomize: bool = True
+    """Domain randomization."""
+
+    def check(self) -> None:
+        """Raise ValueError naming the first field that is out of its range."""
+        super().check()
+        require_one_of("upper_actions", self.upper_actions, UPPER_ACTIONS)
+        if not self.motion:
+            raise ValueError(f"motion must name clips, {MIXTURE!r} or {HELD!r}, got nothing")
+        if len(self.motion) > 1 and not {MIXTURE, HELD}.isdisjoint(self.motion):
+            raise ValueError(f"motion: {MIXTURE!r} and {HELD!r} stand alone, got {self.motion}")
+
+    @property
+    def arms(self) -> str:
+        """Whether the arms' reference moves: moving or held."""
+        return "held" if self.motion == (HELD,) else "moving"
+
+    @property
+    @abstractmethod
+    def seconds(self) -> float:
+        """Length of the evaluation [s]."""
+
+    def configure(self, env_cfg: HumanoidEnvConfig) -> HumanoidEnvConfig:
+        """Turn the environment that a policy was trained in into this protocol's. Changes and returns `env_cfg`."""
+        super().configure(env_cfg)
+        env_cfg.randomization.enabled = self.randomize
+        select_motion(env_cfg.motions.clips, self.motion, self.library)
+        return env_cfg
+
+    def before_step(self, env: HumanoidEnv, step: int) -> None:
+        """Whatever the protocol changes as it goes along."""
+
+    @abstractmethod
+    def measure(self, trajectory: Trajectory, env: HumanoidEnv) -> dict[str, Any]:
+        """The measured part of the evaluation's JSON, falls aside."""
+
+    def record(self, env: HumanoidEnv, policy: PolicyFunction, seconds: float) -> Trajectory:
+        """Run in an environment that is prepared, for so long [s]."""
+        act = acting(env, policy, self.upper_actions)
+        return record_rollout(env, act, round(seconds / env.dt), before_step=self.before_step)
+
+    def evaluate(self, env: HumanoidEnv, policy: PolicyFunction) -> dict[str, Any]:
+        """Run in an environment that is prepared. Returns the measured part of the JSON; `trajectory` is kept."""
+        self.trajectory = self.record(env, policy, self.seconds)
+        return {"num_falls": int(self.trajectory.fell.any(0).sum()), **self.measure(self.trajectory, env)}
+
+    def video(self, path: Path, sheet: Path, env: HumanoidEnv, policy: PolicyFunction) -> None:  # noqa: ARG002
+        """Write a video of the first env as it was evaluated, and a contact sheet."""
+        from cotap.evaluation.render import film_video
+
+        film_video(path, env, self.trajectory.film, sheet)
+
+
+def select_motion(clips: ClipConfig, motion: tuple[str, ...], library: str) -> None:
+    """Have `clips` play what `motion` and `library` say."""
+    clips.library = library or clips.library
+    if motion == (HELD,):
+        clips.share, clips.only = 0.0, ()
+    elif motion != (MIXTURE,):
+        clips.share, clips.only, clips.held_out = 1.0, motion, ()
+
+
+def mirrored_pose(env: HumanoidEnv, left: tuple[float, ...]) -> torch.Tensor:
+    """Arm joints (U,) with `left` on the first arm and its mirror image on every other; the default pose for ().
+
+    Raises:
+        ValueError: `left` has another number of joints than an arm.
+    """
+    if not left:
+        return env.motions.default
+    by_name, first = {j.name: j for j in env.spec.joints}, env.spec.arms[0].joints
+    if len(left) != len(first):
+        raise ValueError(f"arm_pose must have {len(first)} numbers, one for each of {first}, got {len(left)}")
+    values = dict(zip(first, left, strict=True))
+    values |= {by_name[name].mirror_name: by_name[name].mirror_sign * value for name, value in values.items()}
+    return torch.tensor([values[n] for n in env.spec.upper_joints])

@@ -1,0 +1,118 @@
+"""Velocity tracking: random commands, each held for a while, against what the robot does."""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from cotap.checks import require_one_of, require_range
+from cotap.envs import HumanoidEnv, HumanoidEnvConfig
+from cotap.envs.hand_loads import HandLoadConfig
+from cotap.evaluation.metrics import summaries, tracking_measures, tracking_slopes
+from cotap.evaluation.protocol import HELD, RolloutProtocol
+from cotap.evaluation.report import plot_tracking
+from cotap.evaluation.rollout import PolicyFunction, Trajectory
+from cotap.robots.mjcf import COLLISIONS
+
+
+@dataclass
+class VelocityTracking(RolloutProtocol):
+    """Commanded against measured velocity: errors, slopes, falls, gait quality."""
+
+    episode_seconds: float = 20.0
+    """Length of the evaluation [s]."""
+    command_seconds: float = 5.0
+    """How long each command is held [s]."""
+    settle_seconds: float = 1.0
+    """Errors are measured once a command has held for this long [s]."""
+    speed_x: float = 1.0
+    """Largest forward and backward command [m/s]."""
+    speed_y: float = 0.5
+    """Largest sideways command [m/s]."""
+    yaw_rate: float = 0.8
+    """Largest turning command [rad/s]."""
+    height_drop: float = 0.2
+    """Lowest stance below nominal [m]."""
+    stand_probability: float = 0.2
+    """Share of commands that ask the robot to stand."""
+    hand_loads: bool = False
+    """Random loads on both hands in every episode: x and y up to 40 N, z from -50 to 5 N, held for 3 to 5 s."""
+    arm_motion: bool = True
+    """Reference arm motion; otherwise arms hold their default pose, as with `--motion none`."""
+    follow_path: bool = False
+    """Lead the torso along the clips' root path instead of drawing velocity commands."""
+    collision: str = ""
+    """feet (only feet meet the floor) or full (all shapes, each other too); empty keeps what the policy was trained
+    with."""
+
+    def __post_init__(self) -> None:
+        if not self.arm_motion:
+            self.motion = (HELD,)
+
+    def check(self) -> None:
+        """Raise ValueError naming the first field that is out of its range."""
+        super().check()
+        require_range("episode_seconds", self.episode_seconds, self.command_seconds, 3600.0)
+        require_range("command_seconds", self.command_seconds, self.settle_seconds + 0.1, 3600.0)
+        require_range("settle_seconds", self.settle_seconds, 0.0, 3600.0)
+        for name in ("speed_x", "speed_y", "yaw_rate"):
+            require_range(name, getattr(self, name), 0.0, 5.0)
+        require_range("height_drop", self.height_drop, 0.0, 0.5)
+        require_range("stand_probability", self.stand_probability, 0.0, 1.0)
+        if self.collision:
+            require_one_of("collision", self.collision, COLLISIONS)
+
+    @property
+    def seconds(self) -> float:
+        """Length of the evaluation [s]."""
+        return self.episode_seconds
+
+    def configure(self, env_cfg: HumanoidEnvConfig) -> HumanoidEnvConfig:
+        """Turn the environment that a policy was trained in into this protocol's. Changes and returns `env_cfg`."""
+        super().configure(env_cfg)
+        env_cfg.collision = self.collision or env_cfg.collision
+        env_cfg.path.share = float(self.follow_path)
+        env_cfg.forces.hand_loads = HandLoadConfig(enabled=self.hand_loads, episode_share=1.0)
+        c = env_cfg.commands
+        c.velocity_x, c.velocity_y = (-self.speed_x, self.speed_x), (-self.speed_y, self.speed_y)
+        c.yaw_rate, c.height_offset = (-self.yaw_rate, self.yaw_rate), (-self.height_drop, 0.0)
+        c.resample_s = (self.command_seconds, self.command_seconds)
+        c.stand_probability, c.axis_zero_probability = self.stand_probability, 0.0
+        return env_cfg
+
+    def prepare(self, env: HumanoidEnv) -> None:
+        """Hold the arms' default pose, if arms are held."""
+        if self.arms == "held":
+            env.motions.hold(env.motions.default)
+
+    def measure(self, trajectory: Trajectory, env: HumanoidEnv) -> dict[str, Any]:
+        """The measured part of the evaluation's JSON, falls aside."""
+        period = env.cfg.gait.period_s
+        measures = tracking_measures(trajectory, period, self.settle_seconds)
+        stood = ~trajectory.fell.any(0)
+        metrics = summaries(measures, torch.ones_like(stood), self.seed)
+        slopes = tracking_slopes(trajectory, period, self.settle_seconds)
+        return {
+            "e_lin": metrics["e_lin"]["mean"],
+            "e_yaw": metrics["e_yaw"]["mean"],
+            "episode_length_fraction": metrics["episode_length_fraction"]["mean"],
+            "slopes": {name: None if math.isnan(value) else value for name, value in slopes.items()},
+            "metrics": metrics,
+            "metrics_without_falls": summaries(measures, stood, self.seed),
+            "window": {"start": 0.0, "end": self.episode_seconds},
+        }
+
+    def plot(self, path: Path, result: dict[str, Any]) -> None:
+        """Commanded against measured velocity, and heights in stance."""
+        plot_tracking(path, self.trajectory, result["settings"]["env"]["gait"]["period_s"], self.settle_seconds)
+
+    def video(self, path: Path, sheet: Path, env: HumanoidEnv, policy: PolicyFunction) -> None:
+        """Write a video of one robot on a tour of commands, and a contact sheet."""
+        from cotap.evaluation.render import tour_video
+
+        tour_video(path, copy.deepcopy(env.cfg), policy, sheet)

@@ -1,0 +1,71 @@
+"""Descriptions that contradict themselves are refused, by the name of what is wrong."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+
+def changed(spec, name, **fields):
+    """The robot with fields of one joint changed."""
+    joints = tuple(dataclasses.replace(j, **fields) if j.name == name else j for j in spec.joints)
+    return dataclasses.replace(spec, joints=joints)
+
+
+def test_joints_must_be_ordered_lower_body_first(spec):
+    with pytest.raises(ValueError, match="lower body first"):
+        dataclasses.replace(spec, joints=spec.joints[::-1])
+
+
+def test_joints_must_follow_the_bodies(any_spec):
+    first, second, *rest = any_spec.joints
+    names = f"joint '{second.name}' is out of order, '{first.name}' is next"
+    with pytest.raises(ValueError, match=names):
+        dataclasses.replace(any_spec, joints=(second, first, *rest))
+    with pytest.raises(ValueError, match=f"joint '{rest[0].name}' is out of order, '{second.name}' is next"):
+        dataclasses.replace(any_spec, joints=(first, *rest))
+    last = any_spec.bodies[-1]
+    with pytest.raises(ValueError, match=f"joint '{last.joint}' is out of order, None is next"):
+        dataclasses.replace(any_spec, bodies=any_spec.bodies[:-1])
+
+
+def test_bodies_may_be_listed_by_depth(any_spec):
+    """Only the order among siblings counts, as for MuJoCo."""
+    depth = {b.name: len(any_spec.chain(b.name, any_spec.base_body)) for b in any_spec.bodies}
+    by_depth = tuple(sorted(any_spec.bodies, key=lambda b: depth[b.name]))
+    assert by_depth != any_spec.bodies
+    dataclasses.replace(any_spec, bodies=by_depth)
+    turned = tuple(sorted(any_spec.bodies, key=lambda b: (depth[b.name], -any_spec.bodies.index(b))))
+    with pytest.raises(ValueError, match="depth first"):
+        dataclasses.replace(any_spec, bodies=turned)
+
+
+def test_mirrors_must_be_mutual(any_spec):
+    first, second = any_spec.joints[:2]
+    with pytest.raises(ValueError, match=f"mirror of {first.name} is unknown: 'nobody'"):
+        changed(any_spec, first.name, mirror_name="nobody")
+    for fields in ({"mirror_name": second.name}, {"mirror_sign": -first.mirror_sign}):
+        with pytest.raises(ValueError, match=f"{first.name} and .* are not each other's mirror"):
+            changed(any_spec, first.name, **fields)
+
+
+def test_arms_must_be_equally_long(any_spec):
+    left, right = any_spec.arms
+    count = len(right.joints)
+    short = dataclasses.replace(left, joints=left.joints[1:])  # its first joint then counts as the waist's
+    with pytest.raises(ValueError, match=f"equally many joints, got {{'left': {count - 1}, 'right': {count}}}"):
+        dataclasses.replace(any_spec, arms=(short, right))
+
+
+def test_bodies_must_exist(any_spec):
+    arm, foot = any_spec.arms[0], any_spec.feet[0]
+    wrong = (
+        {"torso_body": "nothing"},
+        {"arms": (dataclasses.replace(arm, hand_body="nothing"), any_spec.arms[1])},
+        {"feet": (dataclasses.replace(foot, body="nothing"), any_spec.feet[1])},
+        {"contact_excludes": (("nothing", foot.body),)},
+    )
+    for fields in wrong:
+        with pytest.raises(ValueError, match=f"{any_spec.name} has no body 'nothing'"):
+            dataclasses.replace(any_spec, **fields)

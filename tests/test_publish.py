@@ -1,0 +1,75 @@
+"""scripts/publish.py: what is shipped of a checkpoint, and what stands beside it."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from random_policy import save_random_policy
+
+from cotap.agents.checkpoint import load_checkpoint, save_checkpoint, sha256
+from cotap.evaluation.policy import load_policy
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
+import publish
+
+TINY = ["velocity-tracking", "--episode-seconds", "2", "--command-seconds", "1.5", "--threads", "1"]
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder in place of the package's, and evaluations that take seconds."""
+    monkeypatch.setattr(publish, "checkpoint_path", lambda name: tmp_path / "checkpoints" / f"{name}.pt")
+    evaluations = {"velocity-tracking": [*TINY, "--num-envs", "ENVS"], "small": [*TINY, "--num-envs", "2"]}
+    monkeypatch.setattr(publish, "EVALUATIONS", evaluations)
+    return tmp_path / "checkpoints"
+
+
+@pytest.mark.parametrize(("name", "stage", "method"), [("h1-base", "base", "pd"), ("h1-cotap", "distill", "cotap")])
+def test_weights_provenance_and_evaluations_are_written(
+    tmp_path: Path, package: Path, name: str, stage: str, method: str
+):
+    source = save_random_policy(tmp_path / "run.pt", stage, seed=3)
+    assert publish.main([str(source), name, "--envs", "3"]) == 0
+    assert sorted(p.name for p in package.iterdir()) == sorted(
+        f"{name}{end}" for end in (".pt", ".json", ".velocity-tracking.json", ".small.json")
+    )
+    before, after = load_checkpoint(source), load_checkpoint(package / f"{name}.pt")
+    assert before["learner"]
+    assert before["env"]
+    assert after["learner"] == after["env"] == {}
+    assert not {"rng", "device_rng", "infos"} & after.keys()
+    for key, value in before["model"].items():
+        assert torch.equal(after["model"][key], value), key
+    assert load_policy(package / f"{name}.pt").stage == stage
+    said = json.loads((package / f"{name}.json").read_text())
+    assert said["sha256"] == sha256(package / f"{name}.pt")
+    assert (said["robot"], said["stage"], said["seed"], said["hours"]) == ("h1", stage, 3, 0.0)
+    assert {"command", "commit", "samples", "iterations", "machine"} <= said.keys()
+    assert {k: v["num_envs"] for k, v in said["evaluations"].items()} == {"velocity-tracking": 3, "small": 2}
+    result = json.loads((package / f"{name}.small.json").read_text())
+    assert result["settings"]["checkpoint_sha256"] == said["sha256"]
+    assert result["method"] == method
+
+
+def test_all_runs_that_a_policy_went_through_are_named(tmp_path: Path, package: Path):
+    content = load_checkpoint(save_random_policy(tmp_path / "run.pt"))
+    content["config"] |= {"earlier_runs": [{"command": "first", "commit": "a"}], "command": f"{Path.cwd()}/second"}
+    save_checkpoint(tmp_path / "run.pt", content)
+    assert publish.main([str(tmp_path / "run.pt"), "h1-base", "--envs", "2"]) == 0
+    said = json.loads((package / "h1-base.json").read_text())
+    assert [run["command"] for run in said["runs"]] == ["first", "second"]  # and no folder of this machine
+
+
+@pytest.mark.parametrize(("content", "message"), [(None, "does not exist"), ({"model": {}}, "lacks its part 'kind'")])
+def test_what_is_no_checkpoint_of_a_run_is_refused_and_leaves_nothing(
+    tmp_path: Path, package: Path, capsys: pytest.CaptureFixture[str], content: dict | None, message: str
+):
+    if content is not None:
+        save_checkpoint(tmp_path / "odd.pt", content)
+    assert publish.main([str(tmp_path / "odd.pt"), "h1-base"]) == 2
+    assert message in capsys.readouterr().err
+    assert not package.exists()
