@@ -52,7 +52,8 @@ def without_folder(value: Any, folder: str) -> Any:
 def description(target: Path, content: dict[str, Any], headlines: dict[str, Any]) -> dict[str, Any]:
     """What NAME.json says."""
     config = content["config"]
-    runs = [*config.get("earlier_runs", []), {key: config[key] for key in ("command", "commit")}]
+    last = {key: config[key] for key in ("command", "commit")} | {"samples": content["samples"]}
+    runs = [*config.get("earlier_runs", []), last]
     return {
         "sha256": sha256(target),
         "robot": content["layout"]["robot"],

@@ -295,6 +295,8 @@ def _train(stage: str, options: BaseOptions | DistillOptions, base: dict[str, An
     training.check()
     config = {"stage": stage, "training": to_plain(training), **provenance(options.command, training.env.backend)}
     if options.resume:
+        config["earlier_runs"] = _earlier_runs(options.resume)
+    if options.resume:
         config["earlier_runs"] = _runs_behind(options.resume)
     training.env.seed, training.env.num_threads = ranks.seed(training.seed), ranks.threads(training.threads)
     training.device = ranks.device(training.device)
@@ -329,6 +331,16 @@ def _runs_behind(checkpoint: str) -> list[dict[str, str]]:
     config = load_checkpoint(checkpoint)["config"]
     earlier, own = config.get("earlier_runs", []), {key: config.get(key, "") for key in ("command", "commit")}
     return [*(earlier if isinstance(earlier, list) else []), own]
+
+
+def _earlier_runs(checkpoint: str) -> list[dict[str, Any]]:
+    """Command, commit and last sample of every run that a checkpoint comes from, the first one first."""
+    from cotap.agents.checkpoint import load_checkpoint
+
+    content = load_checkpoint(checkpoint)
+    config = content["config"]
+    last = {name: config.get(name, "") for name in ("command", "commit")} | {"samples": content["samples"]}
+    return [*config.get("earlier_runs", []), last]
 
 
 def _guide(env: Any, options: DistillOptions, base: dict[str, Any] | None) -> Any:

@@ -29,7 +29,7 @@ TERMS = {name: declared.function for group in GROUPS for name, declared in group
 SCALES = RobotScales(
     joint_low=torch.full((5,), -0.5), joint_high=torch.full((5,), 0.5),
     default_position=torch.tensor([0.1, -0.2, 0.3, 0.0, 0.0]), num_lower=3, hip_waist=(0,), foot_clearance_m=0.1,
-    foot_distance_m=0.18,
+    foot_distance_m=0.18, torso_ahead_m=0.0,
 )  # fmt: skip
 LEFT_LIFTED = {"desired_contact": [[False, True]], "swing": [[0.5, 0.0]]}
 
@@ -90,8 +90,9 @@ def changed(**changes) -> StepRecord:
     record = perfect()
     for name, value in changes.items():
         holder = next(h for h in (record, record.state, record.command, record.reference) if hasattr(h, name))
-        value = torch.as_tensor(value)
-        assert value.shape == getattr(holder, name).shape
+        if not isinstance(value, RobotScales):
+            value = torch.as_tensor(value)
+            assert value.shape == getattr(holder, name).shape
         new = dataclasses.replace(holder, **{name: value})
         if holder is record:
             record = new
@@ -134,6 +135,12 @@ CASES = [
     ("capture_point", {**STANDING, "torso_pos_w": [[2.9, -2.0, HEIGHT]]}, math.exp(-(0.05**2 + 0.06**2) / 0.01)),
     ("capture_point", {**STANDING, "heading_w": matrix_about_z(math.pi / 2)}, math.exp(-(0.06**2 + 0.15**2) / 0.01)),
     ("capture_point", {"torso_pos_w": [[2.9, -2.0, HEIGHT]]}, 0.0),
+    # A torso that stands 0.05 m ahead of its feet by default is heading to 0.1 m ahead of where it belongs, not 0.15.
+    (
+        "capture_point",
+        {**STANDING, "scales": dataclasses.replace(SCALES, torso_ahead_m=0.05)},
+        math.exp(-(0.1**2 + 0.06**2) / 0.01),
+    ),
     ("upright", {"projected_gravity_t": [[0.3, -0.4, -math.sqrt(0.75)]]}, 0.25),
     ("vertical_velocity", {"torso_linear_velocity_h": [[0.5, -0.2, -0.3]]}, 0.09),
     ("roll_pitch_rate", {"torso_angular_velocity_t": [[0.3, -0.4, 7.0]]}, 0.25),

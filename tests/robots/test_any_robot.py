@@ -103,6 +103,8 @@ def test_default_pose_has_its_soles_on_the_floor_and_the_torso_at_its_height(any
         np.testing.assert_allclose(sole.xmat.reshape(3, 3)[:, 2], [0, 0, 1], atol=1e-6)
     assert any_spec.sole_distance_m == pytest.approx(soles[0].xpos[1] - soles[1].xpos[1], abs=1e-9)
     assert soles[0].xpos[1] > 0.05
+    torso = data.body(any_spec.torso_body)
+    assert any_spec.torso_ahead_m == pytest.approx(torso.xpos[0] - (soles[0].xpos[0] + soles[1].xpos[0]) / 2, abs=1e-9)
 
 
 def test_a_bent_waist_counts_in_the_base_height():

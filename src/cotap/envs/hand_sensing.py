@@ -21,7 +21,7 @@ class HandSensors(Stateful):
 
     Args:
         arms: Nominal model of the arms, which estimates use.
-        num_envs: Number of worlds.
+        num_envs: Number of envs.
         dt: Control step [s].
         estimates: Whether anyone asks for estimates; without, none are made.
     """
@@ -36,7 +36,7 @@ class HandSensors(Stateful):
         self._momentum, self._torque = (torch.zeros(num_envs, num_arms, joints, dtype=arms.kp.dtype) for _ in range(2))
 
     def reset(self, mask: torch.Tensor) -> None:
-        """Arms in the worlds of `mask` start at rest, with nothing on their hands."""
+        """Arms in the envs of `mask` start at rest, with nothing on their hands."""
         for name in self.STATE:
             getattr(self, name)[mask] = 0.0
 

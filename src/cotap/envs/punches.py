@@ -1,4 +1,4 @@
-"""Punches on the arms: short blows at random joints in random directions, one in every stretch of time."""
+"""Punches on the arms: short pushes at random joints in random directions, one in every stretch of time."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from cotap.persistence import Stateful, uniform
 
 @dataclass
 class PunchConfig:
-    """One blow per segment of time, each at a random moment, on a random arm joint, in a random direction."""
+    """one punch per segment of time, each at a random moment, on a random arm joint, in a random direction."""
 
     force_n: float = 0.0
-    """Largest force [N]; blows are uniform between 0 and this. 0 for none."""
+    """Largest force [N]; punches are uniform between 0 and this. 0 for none."""
     duration_s: float = 0.08
-    """How long a blow lasts [s]."""
+    """how long a punch lasts [s]."""
     segment_s: float = 5.0
-    """Time in which there is one blow [s]."""
+    """Time in which there is one punch [s]."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
@@ -29,7 +29,7 @@ class PunchConfig:
 
 
 class Punches(Stateful):
-    """The blow that each of N envs takes in its present segment, on one of `num_joints` arm joints."""
+    """The punch that each of N envs takes in its present segment, on one of `num_joints` arm joints."""
 
     STATE = ("joint", "_force_w", "_start_s", "_left_s")
 
@@ -37,14 +37,14 @@ class Punches(Stateful):
         cfg.check()
         self.cfg, self._dt, self._num_joints = cfg, dt, num_joints
         self.active = cfg.force_n > 0.0
-        """Whether there are any blows."""
+        """Whether there are any punches."""
         self.joint = torch.zeros(num_envs, dtype=torch.long)
         """(N,) which arm joint is struck."""
         self._force_w = torch.zeros(num_envs, 3)
         self._start_s, self._left_s = torch.zeros(num_envs), torch.zeros(num_envs)
 
     def reset(self, mask: torch.Tensor, rng: torch.Generator) -> None:
-        """A new segment with a new blow for the envs of `mask`."""
+        """A new segment with a new punch for the envs of `mask`."""
         n = int(mask.sum())
         if not self.active or n == 0:
             return
@@ -64,7 +64,7 @@ class Punches(Stateful):
     def current(self) -> torch.Tensor:
         """Forces (N, num_joints, 3) on the arm joints now [N], world frame."""
         since = self.cfg.segment_s - self._left_s - self._start_s
-        # The share of this control step that the blow lasts: its impulse is exact whatever the step.
+        # The share of this control step that the punch lasts: its impulse is exact whatever the step.
         begin, end = since.clamp(0.0, self.cfg.duration_s), (since + self._dt).clamp(0.0, self.cfg.duration_s)
         force = self._force_w * ((end - begin) / self._dt).unsqueeze(1)
         struck = torch.nn.functional.one_hot(self.joint, self._num_joints)

@@ -43,6 +43,8 @@ class RobotScales:
     """Height of the sole at mid-swing that is asked for: a tenth of the torso's nominal height."""
     foot_distance_m: float
     """Sideways distance of the soles below which feet are too close: 0.45 of that in the default pose."""
+    torso_ahead_m: float
+    """How far ahead of the middle of the soles the torso's origin is when the robot stands in its default pose."""
 
     @classmethod
     def of(cls, spec: RobotSpec) -> RobotScales:
@@ -54,7 +56,8 @@ class RobotScales:
         hip_waist = (i for i, j in enumerate(joints[:num_lower]) if j.mirror_sign < 0.0 and j.name not in ankles)
         default = torch.tensor([j.default_rad for j in joints])
         clearance, distance = 0.1 * spec.nominal_height_m, 0.45 * spec.sole_distance_m
-        return cls(center - half, center + half, default, num_lower, tuple(hip_waist), clearance, distance)
+        low, high = center - half, center + half
+        return cls(low, high, default, num_lower, tuple(hip_waist), clearance, distance, spec.torso_ahead_m)
 
 
 @dataclass(frozen=True)
@@ -197,9 +200,11 @@ class LowerRewards:
 
     @term(0.75)
     def capture_point(s: StepRecord) -> torch.Tensor:
-        """While standing, closeness of the capture point (where the torso is heading to) to the middle of the feet."""
-        ahead_w = rotate(s.state.heading_w, FALLING_TIME_S * s.state.torso_linear_velocity_h)
-        point = (s.state.torso_pos_w + ahead_w)[:, :2]
+        """While standing, closeness of the capture point, where the torso is heading to, to where it stands by default
+        over the middle of the feet."""
+        ahead_h = FALLING_TIME_S * s.state.torso_linear_velocity_h
+        ahead_h = torch.cat((ahead_h[:, :1] - s.scales.torso_ahead_m, ahead_h[:, 1:]), 1)
+        point = (s.state.torso_pos_w + rotate(s.state.heading_w, ahead_h))[:, :2]
         middle = s.state.foot_pos_w[:, :, :2].mean(1)
         return s.command.stand * torch.exp(-(point - middle).square().sum(1) / 0.01)
 

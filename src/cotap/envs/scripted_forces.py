@@ -31,7 +31,7 @@ class ForceProfile:
     random_direction: bool = False
     """Turn the force about the vertical by a random angle, drawn per env and episode."""
     place: str = "hand"
-    """hand, or base: at the base's centre of mass , and on no hand."""
+    """hand, or base: at the base's centre of mass, and on no hand."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""

@@ -1,4 +1,4 @@
-"""The arms' laws inside the environment: chosen by name per arm, parameters per world, torque at the physics rate."""
+"""The arms' laws inside the environment: chosen by name per arm, parameters per env, torque at the physics rate."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class TorsoComplianceConfig:
 
 @dataclass
 class LawSampling:
-    """Parameters of laws drawn at random, per world and arm, at every episode and again within it."""
+    """Parameters of laws drawn at random, per env and arm, at every episode and again within it."""
 
     enabled: bool = False
     """Whether they are drawn; otherwise they stay as the laws' configs have them."""
@@ -98,7 +98,7 @@ class UpperBodyConfig:
 class UpperBody(Stateful):
     """Asks each arm's law once a control step and gives its torque at every physics step.
 
-    `parameters` are per-world tensors that anyone may write to at any step. A command that is late (control delay) is
+    `parameters` are per-env tensors that anyone may write to at any step. A command that is late (control delay) is
     mixed with the one before it by the time that each holds, as with PD targets.
     """
 
@@ -131,10 +131,10 @@ class UpperBody(Stateful):
         self._hold_s = torch.zeros(n)
         self._torso = _TorsoModel(cfg.torso, spec, dtype)
         self.log: dict[str, torch.Tensor] = {}
-        """Means over worlds and arms of what the laws report about the last step."""
+        """Means over envs and arms of what the laws report about the last step."""
 
-    def set_law(self, world: int, arm: int, law: LawConfig) -> None:
-        """Put one arm of one world under another law, or other parameters, from the next command on.
+    def set_law(self, env: int, arm: int, law: LawConfig) -> None:
+        """Put one arm of one env under another law, or other parameters, from the next command on.
 
         Raises:
             ValueError: a field of `law` is out of its range.
@@ -142,16 +142,16 @@ class UpperBody(Stateful):
         law.check()
         under_it = self._mask(law)  # which refuses a law that these arms cannot have, before anything is changed
         p = self.parameters
-        p.stiffness[world, arm] = torch.tensor(law.stiffness)
-        p.null_stiffness[world, arm], p.alpha[world, arm] = law.null_stiffness, law.alpha
-        if under_it[world, arm]:
+        p.stiffness[env, arm] = torch.tensor(law.stiffness)
+        p.null_stiffness[env, arm], p.alpha[env, arm] = law.null_stiffness, law.alpha
+        if under_it[env, arm]:
             return
         for _, _, mine in self._laws.values():
-            mine[world, arm] = False
-        under_it[world, arm] = True
+            mine[env, arm] = False
+        under_it[env, arm] = True
         self._laws = {kind: driven for kind, driven in self._laws.items() if driven[2].any()}
         self.sensors.estimates = any(config.sensing == "estimated" for _, config, _ in self._laws.values())
-        self.fresh[world] = True
+        self.fresh[env] = True
 
     @property
     def active(self) -> bool:
@@ -164,7 +164,7 @@ class UpperBody(Stateful):
         return self._stiffness[1]
 
     def reset(self, mask: torch.Tensor, rng: torch.Generator) -> None:
-        """The next command of the worlds in `mask` has none before it; their parameters are drawn anew."""
+        """The next command of the envs in `mask` has none before it; their parameters are drawn anew."""
         self.fresh = self.fresh | mask
         self.sensors.reset(mask)
         if self._cfg.sampling.enabled:

@@ -147,6 +147,12 @@ class RobotSpec:
         first, second = (self._sole(foot) for foot in self.feet[:2])
         return abs(float(first[1] - second[1]))
 
+    @cached_property
+    def torso_ahead_m(self) -> float:
+        """How far ahead of the middle of the soles the torso link's origin is in the default pose."""
+        torso, _ = body_frame(self, self.torso_body, self.base_body, default_angles(self))
+        return float(torso[0] - sum(self._sole(foot)[0] for foot in self.feet) / len(self.feet))
+
     def __post_init__(self) -> None:
         self._check_order()
         self._check_mirrors()
