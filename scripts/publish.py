@@ -20,10 +20,26 @@ from cotap.evaluation.policy import CHECKPOINTS, checkpoint_path, find_checkpoin
 
 TRACKING, ENVS = "velocity-tracking", "ENVS"
 HELD_OUT = ("dance_b", "dance_b_mirrored", "kick", "kick_mirrored")
+PUSHES = {"base-25": ("base", "500"), "base-50": ("base", "1000"), "hand-25": ("hand", "500")}
+"""Where a push of 50 ms acts, and its force [N], by place and impulse [N s]."""
+
+
+def pushed(place: str, force: str, mode: str) -> list[str]:
+    """A push in any horizontal direction on robots that stand or walk, arms moving."""
+    push = ["--place", place, "--force", force, "0", "0", "--random-direction"]
+    return ["impact", "--num-envs", ENVS, "--mode", mode, *push]
+
+
 EVALUATIONS: dict[str, list[str]] = {
     TRACKING: [TRACKING, "--num-envs", ENVS],
     f"{TRACKING}.hand-loads": [TRACKING, "--num-envs", ENVS, "--hand-loads"],
     f"{TRACKING}.held-out": [TRACKING, "--num-envs", ENVS, "--motion", *HELD_OUT],
+    f"{TRACKING}.reference-arms": [TRACKING, "--num-envs", ENVS, "--upper-actions", "reference"],
+    **{f"impact.{name}.{mode}": pushed(*push, mode) for name, push in PUSHES.items() for mode in ("stance", "walking")},
+    **{
+        f"fall-curve.{mode}": ["fall-curve", "--num-envs", ENVS, "--place", "base", "--mode", mode]
+        for mode in ("stance", "walking")
+    },
     f"{TRACKING}.small": [TRACKING, "--num-envs", "64", "--episode-seconds", "10", "--threads", "1"],
 }
 """By name; a test repeats the small one. ENVS stands for `--envs`."""
@@ -81,7 +97,7 @@ def publish(source: Path, name: str, envs: int) -> int:
         if status := evaluate([*args, "--checkpoint", str(target), "--json", str(out)]):
             return status
         result = json.loads(out.read_text())
-        headlines[evaluation] = {key: result[key] for key in HEADLINE}
+        headlines[evaluation] = {key: result[key] for key in HEADLINE if key in result}
     write_json(target.with_suffix(".json"), description(target, content, headlines))
     return 0
 

@@ -296,8 +296,6 @@ def _train(stage: str, options: BaseOptions | DistillOptions, base: dict[str, An
     config = {"stage": stage, "training": to_plain(training), **provenance(options.command, training.env.backend)}
     if options.resume:
         config["earlier_runs"] = _earlier_runs(options.resume)
-    if options.resume:
-        config["earlier_runs"] = _runs_behind(options.resume)
     training.env.seed, training.env.num_threads = ranks.seed(training.seed), ranks.threads(training.threads)
     training.device = ranks.device(training.device)
     if training.env.num_threads:
@@ -322,15 +320,6 @@ def _train(stage: str, options: BaseOptions | DistillOptions, base: dict[str, An
     if ranks.leads:
         say(f"{runner.current_learning_iteration} iterations, {runner.wall_seconds:.0f} s: {run_dir}")
     return run_dir
-
-
-def _runs_behind(checkpoint: str) -> list[dict[str, str]]:
-    """Command and commit of the runs that a checkpoint comes from, oldest first."""
-    from cotap.agents.checkpoint import load_checkpoint
-
-    config = load_checkpoint(checkpoint)["config"]
-    earlier, own = config.get("earlier_runs", []), {key: config.get(key, "") for key in ("command", "commit")}
-    return [*(earlier if isinstance(earlier, list) else []), own]
 
 
 def _earlier_runs(checkpoint: str) -> list[dict[str, Any]]:
