@@ -171,8 +171,8 @@ def ablations(book: Book, motion: str, quick: bool) -> None:
     rows = {
         "no training": ("base", ["--upper-actions", "reference"]),
         "no training, base policy's own arm actions": ("base", []),
-        "without the ratio": ("no-ratio", ["--no-singularity-ratio"]),
-        "CoTaP's policy, the ratio left out of the law alone": ("cotap", ["--no-singularity-ratio"]),
+        "without the ratio": ("no-ratio", ["--singularity-ratio", "False"]),
+        "CoTaP's policy, the ratio left out of the law alone": ("cotap", ["--singularity-ratio", "False"]),
         "arm torque in the critic's observation": ("torque-critic", []),
         "goals in the observation": ("goals", []),
         "CoTaP": ("cotap", []),
@@ -514,8 +514,8 @@ def singular(book: Book) -> None:
     """A reference with stretched arms, with and without the ratio: how far the arms stay from it, and a picture."""
     rows = {
         "with the ratio": ("cotap", []),
-        "trained without the ratio": ("no-ratio", ["--no-singularity-ratio"]),
-        "ratio left out of the law alone": ("cotap", ["--no-singularity-ratio"]),
+        "trained without the ratio": ("no-ratio", ["--singularity-ratio", "False"]),
+        "ratio left out of the law alone": ("cotap", ["--singularity-ratio", "False"]),
     }
     book.add(
         "",

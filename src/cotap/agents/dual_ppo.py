@@ -39,7 +39,7 @@ class DualPPOConfig:
     least_std: float = 0.25
     """Where that fall ends."""
     steps: int = 24
-    """Steps per world and iteration."""
+    """Steps per env and iteration."""
     epochs: int = 3
     """Passes over a rollout."""
     mini_batches: int = 4
@@ -97,7 +97,7 @@ class DualPPOConfig:
 
 @dataclass
 class Rollout:
-    """What one iteration collects: T steps, N worlds, G agents. Observations are stored normalised."""
+    """What one iteration collects: T steps, N envs, G agents. Observations are stored normalised."""
 
     observations: Observations
     actions: torch.Tensor
@@ -116,11 +116,11 @@ class DualPPO:
 
     Args:
         layout: Sizes, slices and groups, from the environment.
-        num_envs: Number of worlds.
+        num_envs: Number of envs.
         cfg: Hyperparameters.
         device: Where the networks live.
         guide: A frozen policy that agents are kept close to at first; None for none.
-        ranks: The processes that learn as one, each from its own `num_envs` worlds.
+        ranks: The processes that learn as one, each from its own `num_envs` envs.
     """
 
     def __init__(

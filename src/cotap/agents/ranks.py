@@ -24,7 +24,7 @@ _BUCKET_MB = 32.0
 class Ranks:
     """This process among all that `torchrun` started; a process by itself is rank 0 of 1, and tells nobody anything.
 
-    Every rank has worlds and random numbers of its own; networks, optimisers and normalisers are the same everywhere.
+    Every rank has envs and random numbers of its own; networks, optimisers and normalisers are the same everywhere.
     """
 
     rank: int = 0
@@ -62,7 +62,7 @@ class Ranks:
         return self.rank == 0
 
     def seed(self, seed: int) -> int:
-        """Seed of this rank's worlds and exploration; rank 0 has `seed` itself."""
+        """Seed of this rank's envs and exploration; rank 0 has `seed` itself."""
         return seed + 1_000_003 * self.rank
 
     def threads(self, threads: int) -> int:

@@ -51,7 +51,7 @@ def joint_inertia(links: LinkInertias, pose: ChainPose) -> torch.Tensor:
     By composite bodies: a joint that turns at unit rate gives all that it carries a momentum about the root's origin,
     and its inertia with a joint before it is that joint's own motion times that momentum.
     """
-    # Worlds last: every operation then runs along them.
+    # Envs last: every operation then runs along them.
     anchors, axes, rotations = (x.movedim(0, -1).contiguous() for x in (pose.anchors, pose.axes, pose.rotations))
     centers = anchors + (rotations * links.com[..., None, :, None]).sum(3)
     weighted = links.mass[..., None, None] * centers

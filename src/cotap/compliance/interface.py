@@ -17,7 +17,7 @@ from cotap.compliance.kinematics import ChainPose, SerialChains
 
 @dataclass
 class LawParameters:
-    """What may differ between worlds and change at any step. N worlds, A arms."""
+    """What may differ between envs and change at any step. N envs, A arms."""
 
     stiffness: torch.Tensor
     """(N, A, 3) hand stiffness along the axes of the heading frame [N/m]."""
@@ -124,16 +124,16 @@ class UpperBodyLaw(Protocol):
 
 
 class Remembering:
-    """Base of laws that carry something from step to step: tensors with the worlds in front, in `memory` by name.
+    """Base of laws that carry something from step to step: tensors with the envs in front, in `memory` by name.
 
-    Whoever asks a law saves its memory with everything else, and marks worlds that begin anew as fresh.
+    Whoever asks a law saves its memory with everything else, and marks envs that begin anew as fresh.
     """
 
     def __init__(self) -> None:
         self.memory: dict[str, torch.Tensor] = {}
 
     def recall(self, state: ArmState, name: str, initial: torch.Tensor) -> torch.Tensor:
-        """What was remembered under `name`, and `initial` (N, ...) in worlds that are fresh."""
+        """What was remembered under `name`, and `initial` (N, ...) in envs that are fresh."""
         held = self.memory.get(name)
         if held is None or state.fresh is None:
             return initial

@@ -24,7 +24,7 @@ RETURN = 0.02
 
 @dataclass(frozen=True)
 class IKSolution:
-    """Where the arms are to be. N worlds, A arms of n joints."""
+    """Where the arms are to be. N envs, A arms of n joints."""
 
     position: torch.Tensor
     """(N, A, n) within the joints' limits [rad]."""

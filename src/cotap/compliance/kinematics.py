@@ -1,4 +1,4 @@
-"""Forward kinematics of serial chains of hinges, batched over worlds and over chains of equal length."""
+"""Forward kinematics of serial chains of hinges, batched over envs and over chains of equal length."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from cotap.rotations import matrix_from_quat
 
 @dataclass(frozen=True)
 class ChainPose:
-    """Where the links of a chain are, in the frame of its root. W worlds, A chains, n joints."""
+    """Where the links of a chain are, in the frame of its root. W envs, A chains, n joints."""
 
     anchors: torch.Tensor
     """Joint origins, which are the links' origins, (W, A, n, 3) [m]."""
@@ -32,7 +32,7 @@ class ChainPose:
 class SerialChains:
     """Hinge chains rooted in one body, such as the two arms of a torso.
 
-    Poses are computed with worlds last in memory, and returned as views with worlds first: small matrices side by side
+    Poses are computed with envs last in memory, and returned as views with envs first: small matrices side by side
     take several times as long.
 
     Args:
@@ -85,5 +85,5 @@ class SerialChains:
 
 
 def _last(constant: torch.Tensor) -> torch.Tensor:
-    """A chain's constant (A, ...) as (..., A, 1), to go with worlds last."""
+    """A chain's constant (A, ...) as (..., A, 1), to go with envs last."""
     return constant.movedim(0, -1).unsqueeze(-1).contiguous()

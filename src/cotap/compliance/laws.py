@@ -22,7 +22,7 @@ SENSING = ("privileged", "estimated")
 
 @dataclass
 class LawConfig:
-    """One arm's law and its parameters as every world has them at first."""
+    """One arm's law and its parameters as every env has them at first."""
 
     name: str = "pd"
     """pd, soft-pd, cotap, facet, cotap+facet, cotap+facet-matched, hmc or dcc."""
@@ -68,7 +68,7 @@ class LawConfig:
         require_range(f"{where}.reference_share", self.reference_share, 0.01, 0.99)
 
     def kind(self) -> tuple[object, ...]:
-        """All that is not a parameter of worlds: arms that agree in it are driven by one law."""
+        """All that is not a parameter of envs: arms that agree in it are driven by one law."""
         own = {f.name for f in fields(LawParameters)}
         return tuple(getattr(self, f.name) for f in fields(self) if f.name not in own)
 
