@@ -90,11 +90,11 @@ class PipelineOptions:
     """Name of the robot."""
     resume: bool = False
     """Go on with the runs in --run-dir: what is finished is left, what was stopped goes on, what is missing begins."""
-    num_envs: int = 2048
+    num_envs: int = 1024
     """Number of envs."""
-    base_iterations: int = 6103
+    base_iterations: int = 12_207
     """Iterations of stage 1."""
-    distill_iterations: int = 3051
+    distill_iterations: int = 6103
     """Iterations of stage 2."""
     seed: int = 0
     """Seed of both stages."""

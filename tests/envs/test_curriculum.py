@@ -39,8 +39,10 @@ def test_bad_ramps_are_named(ramp, match):
         ramp.check("here")
 
 
-@pytest.mark.parametrize(("samples", "share"), [(0, 1.0), (100, 1.0), (150, 0.75), (250, 0.25), (300, 0.0), (9e9, 0.0)])
-def test_assistance_fades_linearly_to_nothing(samples, share):
+@pytest.mark.parametrize(
+    ("samples", "share"), [(0, 1.0), (100, 1.0), (150, 0.5625), (250, 0.0625), (300, 0.0), (9e9, 0.0)]
+)
+def test_assistance_fades_as_a_square_to_nothing(samples, share):
     assert AssistConfig(enabled=True, full_samples=100, end_samples=300).share(samples) == pytest.approx(share)
     assert AssistConfig(enabled=False, full_samples=100, end_samples=300).share(samples) == 0.0
 
@@ -65,7 +67,7 @@ def test_bad_fields_are_named(cfg, match):
 
 CFG = AssistConfig(
     enabled=True, upright_stiffness=0.8, upright_damping=0.08, yaw_gain=0.06, velocity_gain=0.6, force_limit=0.3,
-    weight_share=0.25, height_stiffness=4.0, height_damping=0.4,
+    weight_share=0.25,
 )  # fmt: skip
 TILT = 0.2
 
@@ -113,10 +115,7 @@ def wrench(spec, heading=0.0, tilt=None, spin_w=(0, 0, 0), off=(0, 0), yaw_rate=
         ({"off": (0.1, -0.2)}, [0.06, -0.12, 0.25], [0, 0, 0]),
         ({"heading": math.pi / 2, "off": (0.1, -0.2)}, [0.12, 0.06, 0.25], [0, 0, 0]),
         ({"off": (3.0, 4.0)}, [0.18, 0.24, 0.25], [0, 0, 0]),  # no more than its limit
-        ({"below": 0.05, "climb": 0.1}, [0, 0, 0.41], [0, 0, 0]),
-        ({"below": -0.05, "climb": 0.1}, [0, 0, 0.01], [0, 0, 0]),
-        ({"below": -1.0}, [0, 0, 0], [0, 0, 0]),  # never pushes down
-        ({"below": 1.0}, [0, 0, 1], [0, 0, 0]),  # never more than the weight
+        ({"below": 0.3, "climb": 0.1}, [0, 0, 0.25], [0, 0, 0]),  # no more for one that sinks: it would hang
     ],
 )
 def test_the_wrench_by_hand_in_units_of_weight(any_spec, errors, force, torque):
@@ -175,17 +174,15 @@ def test_it_pulls_the_robot_as_a_rope_at_its_torso(make_env, robot):
 
 def test_it_fades_as_samples_go_by(make_env, robot):
     """Two envs: 2 samples a step, all of it up to 8, none from 24 on."""
-    assist = AssistConfig(
-        enabled=True, full_samples=8, end_samples=24, height_stiffness=0.0, height_damping=0.0, velocity_gain=0.0
-    )
+    assist = AssistConfig(enabled=True, full_samples=8, end_samples=24, velocity_gain=0.0)
     env = make_env(2, robot=robot, assist=assist, randomization=NOMINAL)
     lift = 0.25 * env.spec.mass_kg * 9.81
     torso = env.sim.model.body(env.spec.torso_body).id
     for step in range(15):
         *_, extras = env.step(zeros(env))
-        share = max(0.0, min(1.0, (24 - 2 * step) / 16))
+        share = max(0.0, min(1.0, (24 - 2 * step) / 16)) ** 2
         assert env.sim.xfrc[:, torso, 2].tolist() == pytest.approx([share * lift] * 2, abs=1e-3)
-        after = max(0.0, min(1.0, (24 - 2 * (step + 1)) / 16))
+        after = max(0.0, min(1.0, (24 - 2 * (step + 1)) / 16)) ** 2
         assert float(extras["log"]["/curriculum/assist"]) == pytest.approx(after)
     assert not env.sim.xfrc.any()
 

@@ -29,7 +29,7 @@ TERMS = {name: declared.function for group in GROUPS for name, declared in group
 SCALES = RobotScales(
     joint_low=torch.full((5,), -0.5), joint_high=torch.full((5,), 0.5),
     default_position=torch.tensor([0.1, -0.2, 0.3, 0.0, 0.0]), num_lower=3, hip_waist=(0,), foot_clearance_m=0.1,
-    foot_distance_m=0.18, torso_ahead_m=0.0,
+    foot_distance_m=0.18, torso_ahead_m=0.0, falling_time_s=0.3,
 )  # fmt: skip
 LEFT_LIFTED = {"desired_contact": [[False, True]], "swing": [[0.5, 0.0]]}
 

@@ -50,6 +50,23 @@ def test_mirrors_must_be_mutual(any_spec):
             changed(any_spec, first.name, **fields)
 
 
+def test_a_mirror_sign_is_a_sign(any_spec):
+    with pytest.raises(ValueError, match=r"must be 1 or -1, got 0.5"):
+        changed(any_spec, any_spec.joints[0].name, mirror_sign=0.5)
+
+
+def test_the_left_foot_comes_first(any_spec):
+    with pytest.raises(ValueError, match="the left foot must come first, got 'right'"):
+        dataclasses.replace(any_spec, feet=any_spec.feet[::-1])
+
+
+def test_joints_that_pitch(any_spec):
+    """By their axis in the base's frame, whatever their mirror sign says."""
+    pitching = {j.name for j in any_spec.joints if any_spec.pitches(j.name)}
+    assert {f"{side}_{part}" for side in ("left", "right") for part in ("hip_pitch", "knee")} <= pitching
+    assert not any(part in name for name in pitching for part in ("hip_yaw", "hip_roll"))
+
+
 def test_arms_must_be_equally_long(any_spec):
     left, right = any_spec.arms
     count = len(right.joints)

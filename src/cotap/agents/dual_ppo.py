@@ -34,9 +34,9 @@ class DualPPOConfig:
     """Hidden layers of every actor and critic."""
     initial_std: float = 0.6
     """Standard deviation of actions at the start."""
-    std_half_life: float = 300.0
+    std_half_life: float = 600.0
     """Iterations in which the largest standard deviation allowed falls by half: wide at first, precise later."""
-    least_std: float = 0.25
+    least_std: float = 0.2
     """Where that fall ends."""
     steps: int = 24
     """Steps per env and iteration."""

@@ -148,7 +148,7 @@ class DualRunner(OnPolicyRunner):
         if first >= last:
             say(f"at iteration {first} of {last}: nothing to do; --iterations says how many in all")
             return
-        if init_at_random_ep_len and first == 0:
+        if init_at_random_ep_len and not env.episode_length_buf.any():
             env.episode_length_buf = torch.randint_like(env.episode_length_buf, high=int(env.max_episode_length))
         ranks.same_everywhere(alg.model)
         run_log = None

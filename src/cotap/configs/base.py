@@ -55,22 +55,23 @@ def default() -> BaseTraining:
     """What ships: walks, stands, bears loads on the hands, and takes pushes; 300 M samples."""
     return BaseTraining(
         env=HumanoidEnvConfig(
+            num_envs=1024,
             assist=AssistConfig(enabled=True),
             forces=ExternalForceConfig(
                 hand_loads=HandLoadConfig(enabled=True, ramp=RampConfig(20e6, 60e6, first=0.1)),
                 pushes=PushConfig(enabled=True, velocity=(0.0, 1.3), ramp=RampConfig(30e6, 80e6)),
             ),
         ),
-        runner=RunnerConfig(iterations=6103),
+        runner=RunnerConfig(iterations=12_207),
     )
 
 
 def quick() -> BaseTraining:
     """Walking in the shortest time: no pushes, no loads; 30 M samples."""
     return BaseTraining(
-        env=HumanoidEnvConfig(assist=AssistConfig(enabled=True, end_samples=20e6)),
-        ppo=DualPPOConfig(std_half_life=200.0, least_std=0.2),
-        runner=RunnerConfig(iterations=610),
+        env=HumanoidEnvConfig(num_envs=1024, assist=AssistConfig(enabled=True, end_samples=16e6)),
+        ppo=DualPPOConfig(std_half_life=400.0),
+        runner=RunnerConfig(iterations=1220),
     )
 
 

@@ -36,7 +36,7 @@ def default(base: BaseTraining) -> DistillTraining:
     )
     _after_base(training)
     env.rewards.upper.reference_closeness = 1.0
-    training.runner.iterations = 3051
+    training.runner.iterations = 6103
     return training
 
 
@@ -55,7 +55,7 @@ def _after_base(training: DistillTraining) -> None:
     """What the base has learned is there from the start, and exploration goes on from where the base's ended."""
     env = training.env
     env.assist = AssistConfig()
-    env.forces.pushes.ramp = env.forces.hand_loads.ramp = RampConfig()
+    env.forces.pushes.ramp, env.forces.hand_loads.ramp = RampConfig(), RampConfig()
     training.ppo.initial_std = training.ppo.least_std
 
 

@@ -28,8 +28,8 @@ class ActionConfig:
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
-        require_range("actions.lower_scale", self.lower_scale, 0.0, 10.0)
-        require_range("actions.upper_scale", self.upper_scale, 0.0, 10.0)
+        require_range("actions.lower_scale", self.lower_scale, 1e-6, 10.0)
+        require_range("actions.upper_scale", self.upper_scale, 1e-6, 10.0)
         require_range("actions.clip", self.clip, 1e-3, 1e6)
         require_one_of("actions.upper_mode", self.upper_mode, UPPER_MODES)
 

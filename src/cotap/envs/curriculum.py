@@ -7,17 +7,16 @@ from dataclasses import dataclass
 import torch
 
 from cotap.checks import require_range
+from cotap.compliance.dynamics import GRAVITY_M_S2
 from cotap.envs.commands import Command
 from cotap.envs.state import RobotState
 from cotap.robots import RobotSpec
 from cotap.rotations import rotate
 
-GRAVITY = 9.81
-
 
 @dataclass
 class RampConfig:
-    """A share that grows linearly from 0 to 1 with the samples (control steps of all envs)."""
+    """A share that grows linearly from `first` to 1 with the samples (control steps of all envs)."""
 
     start_samples: float = 0.0
     """Samples up to which it is `first`."""
@@ -42,18 +41,19 @@ class RampConfig:
 
 @dataclass
 class AssistConfig:
-    """A wrench on the torso that carries the robot through its first steps and fades linearly.
+    """A wrench on the torso that carries the robot through its first steps and fades, ever more slowly.
 
     Without it, standing still is a local optimum that plain reward tables do not leave. Gains are in units of the
-    robot's weight, so that they fit any robot.
+    robot's weight, so that they fit any robot. It lifts a constant share of the weight: a lift that grew as the robot
+    sank would teach it to hang.
     """
 
     enabled: bool = False
     """Whether to assist; training switches it on."""
     full_samples: float = 2e6
     """Samples with full assistance."""
-    end_samples: float = 30e6
-    """Samples after which there is none."""
+    end_samples: float = 24e6
+    """Samples after which there is none. On the way its share falls as the square of what is left."""
     upright_stiffness: float = 0.8
     """Righting torque per radian of tilt, over weight times nominal height [1/rad]."""
     upright_damping: float = 0.08
@@ -66,32 +66,25 @@ class AssistConfig:
     """Largest pull, over weight."""
     weight_share: float = 0.25
     """Share of the weight that is lifted."""
-    height_stiffness: float = 4.0
-    """Lift per metre that the torso is below its commanded height, over weight [1/m]."""
-    height_damping: float = 0.4
-    """The same per m/s [s/m]."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
         require_range("assist.full_samples", self.full_samples, 0.0, 1e15)
         require_range("assist.end_samples", self.end_samples, self.full_samples, 1e15)
         require_range("assist.weight_share", self.weight_share, 0.0, 1.0)
-        for name in (
-            "upright_stiffness", "upright_damping", "yaw_gain", "velocity_gain", "force_limit", "height_stiffness",
-            "height_damping",
-        ):  # fmt: skip
+        for name in ("upright_stiffness", "upright_damping", "yaw_gain", "velocity_gain", "force_limit"):
             require_range(f"assist.{name}", getattr(self, name), 0.0, 100.0)
 
     def share(self, samples: float) -> float:
         """Share of the assistance that is left after so many samples."""
         if not self.enabled or samples >= self.end_samples:
             return 0.0
-        return min(1.0, (self.end_samples - samples) / max(self.end_samples - self.full_samples, 1.0))
+        return min(1.0, (self.end_samples - samples) / max(self.end_samples - self.full_samples, 1.0)) ** 2
 
 
 def assist_wrench(cfg: AssistConfig, spec: RobotSpec, s: RobotState, command: Command) -> torch.Tensor:
     """Force [N] and torque [Nm] on the torso, (N, 6) in the world frame, at full assistance."""
-    weight = spec.mass_kg * GRAVITY
+    weight = spec.mass_kg * GRAVITY_M_S2
     lever = weight * spec.nominal_height_m
     up_w = s.torso_rotation_w[:, :, 2]
     vertical = torch.tensor([0.0, 0.0, 1.0], device=up_w.device).expand_as(up_w)
@@ -101,7 +94,4 @@ def assist_wrench(cfg: AssistConfig, spec: RobotSpec, s: RobotState, command: Co
     error_h = torch.nn.functional.pad(command.velocity_h - s.torso_linear_velocity_h[:, :2], (0, 1))
     pull = cfg.velocity_gain * rotate(s.heading_w, error_h)
     pull = pull * (cfg.force_limit / pull.norm(dim=1, keepdim=True).clamp_min(1e-6)).clamp_max(1.0)
-    # Like a gantry: it lifts, and never pushes down.
-    spring = cfg.height_stiffness * (command.height - s.height)
-    lift = cfg.weight_share + spring - cfg.height_damping * s.torso_linear_velocity_h[:, 2]
-    return torch.cat((weight * (pull + lift.clamp(0.0, 1.0).unsqueeze(1) * vertical), torque), 1)
+    return torch.cat((weight * (pull + cfg.weight_share * vertical), torque), 1)

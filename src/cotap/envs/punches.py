@@ -12,12 +12,12 @@ from cotap.persistence import Stateful, uniform
 
 @dataclass
 class PunchConfig:
-    """one punch per segment of time, each at a random moment, on a random arm joint, in a random direction."""
+    """One punch per segment of time, each at a random moment, on a random arm joint, in a random direction."""
 
     force_n: float = 0.0
     """Largest force [N]; punches are uniform between 0 and this. 0 for none."""
     duration_s: float = 0.08
-    """how long a punch lasts [s]."""
+    """How long a punch lasts [s]."""
     segment_s: float = 5.0
     """Time in which there is one punch [s]."""
 

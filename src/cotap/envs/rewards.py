@@ -5,6 +5,7 @@ Terms are rates: the environment multiplies them by the control step, except `fa
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Annotated, Any, TypeVar, cast
@@ -15,14 +16,12 @@ import tyro
 # Terms stand in the classes of their weights, and are functions of a step's record, no methods.
 # pyright: reportGeneralTypeIssues=false
 from cotap.checks import require_finite
+from cotap.compliance.dynamics import GRAVITY_M_S2
 from cotap.envs.commands import Command
 from cotap.envs.state import RobotState
 from cotap.motions.generator import ArmReference
 from cotap.robots import RobotSpec
 from cotap.rotations import rotate
-
-FALLING_TIME_S = 0.3
-"""Time constant of an inverted pendulum about as high as a humanoid's centre of mass, sqrt(0.9 m / g) [s]."""
 
 
 @dataclass(frozen=True)
@@ -38,13 +37,15 @@ class RobotScales:
     num_lower: int
     """L; the first L joints are the lower agent's."""
     hip_waist: tuple[int, ...]
-    """Lower joints that straight walking does not need: those that roll or turn about the vertical, ankles aside."""
+    """Lower joints that straight walking does not need: those that do not pitch, ankles aside."""
     foot_clearance_m: float
     """Height of the sole at mid-swing that is asked for: a tenth of the torso's nominal height."""
     foot_distance_m: float
     """Sideways distance of the soles below which feet are too close: 0.45 of that in the default pose."""
     torso_ahead_m: float
     """How far ahead of the middle of the soles the torso's origin is when the robot stands in its default pose."""
+    falling_time_s: float
+    """Time constant of an inverted pendulum of nine tenths of the torso's nominal height."""
 
     @classmethod
     def of(cls, spec: RobotSpec) -> RobotScales:
@@ -53,11 +54,14 @@ class RobotScales:
         low, high = torch.tensor([j.range_rad for j in joints]).unbind(1)
         center, half = (low + high) / 2, 0.95 * (high - low) / 2
         ankles = {body.joint for foot in spec.feet for body in spec.bodies if body.name == foot.body}
-        hip_waist = (i for i, j in enumerate(joints[:num_lower]) if j.mirror_sign < 0.0 and j.name not in ankles)
+        hip_waist = (i for i, j in enumerate(joints[:num_lower]) if j.name not in ankles and not spec.pitches(j.name))
         default = torch.tensor([j.default_rad for j in joints])
         clearance, distance = 0.1 * spec.nominal_height_m, 0.45 * spec.sole_distance_m
         low, high = center - half, center + half
-        return cls(low, high, default, num_lower, tuple(hip_waist), clearance, distance, spec.torso_ahead_m)
+        falling_time = math.sqrt(0.9 * spec.nominal_height_m / GRAVITY_M_S2)
+        return cls(
+            low, high, default, num_lower, tuple(hip_waist), clearance, distance, spec.torso_ahead_m, falling_time
+        )
 
 
 @dataclass(frozen=True)
@@ -202,7 +206,7 @@ class LowerRewards:
     def capture_point(s: StepRecord) -> torch.Tensor:
         """While standing, closeness of the capture point, where the torso is heading to, to where it stands by default
         over the middle of the feet."""
-        ahead_h = FALLING_TIME_S * s.state.torso_linear_velocity_h
+        ahead_h = s.scales.falling_time_s * s.state.torso_linear_velocity_h
         ahead_h = torch.cat((ahead_h[:, :1] - s.scales.torso_ahead_m, ahead_h[:, 1:]), 1)
         point = (s.state.torso_pos_w + rotate(s.state.heading_w, ahead_h))[:, :2]
         middle = s.state.foot_pos_w[:, :, :2].mean(1)
@@ -407,3 +411,5 @@ def check_weights(name: str, weights: Any) -> None:
     """Raise ValueError naming the first weight of the group `name` that is not finite."""
     for f in fields(weights):
         require_finite(f"rewards.{name}.{f.name}", getattr(weights, f.name))
+    if not any(getattr(weights, f.name) for f in fields(weights)):
+        raise ValueError(f"rewards.{name} must have a weight that is not 0")

@@ -131,7 +131,7 @@ class StateReader:
     def read(self, ids: torch.Tensor | None = None) -> RobotState:
         """The state now, of all envs or of the envs `ids` (n,)."""
         rows = slice(None) if ids is None else ids
-        qpos, qvel = self._source.qpos[rows].to(self._dtype), self._source.qvel[rows].to(self._dtype)
+        qpos, qvel = (x[rows].to(self._dtype, copy=True) for x in (self._source.qpos, self._source.qvel))
         q, dq = qpos[:, 7:], qvel[:, 6:]
         base = matrix_from_quat(torch.nn.functional.normalize(qpos[:, 3:7], dim=-1))
         waist = self._waist.pose(q[:, None, self._waist_ids])

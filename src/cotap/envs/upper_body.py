@@ -265,9 +265,7 @@ class UpperBody(Stateful):
         if saved.keys() != present.keys():
             raise ValueError(f"UpperBody.parameters expects {sorted(present)}, got {sorted(saved)}")
         parameters = {k: restored(f"UpperBody.parameters.{k}", saved[k], v) for k, v in present.items()}
-        # States from before laws had senses and memories are of laws that need none.
-        if "sensors" in own:
-            self.sensors.load_state_dict(own.pop("sensors"))
+        self.sensors.load_state_dict(own.pop("sensors", {}))
         memories, remembering = own.pop("memories", []), self._remembering()
         if len(memories) != len(remembering):
             raise ValueError(f"the arms' laws remember {len(remembering)} states, got {len(memories)}")

@@ -147,6 +147,12 @@ class RobotSpec:
         first, second = (self._sole(foot) for foot in self.feet[:2])
         return abs(float(first[1] - second[1]))
 
+    def pitches(self, joint: str) -> bool:
+        """Whether a joint's axis lies along the base's y axis in the default pose, rather than along x or z."""
+        body = next(b.name for b in self.bodies if b.joint == joint)
+        _, rotation = body_frame(self, body, self.base_body, default_angles(self))
+        return abs(float((rotation @ self.joint(joint).axis)[1])) > 0.7
+
     @cached_property
     def torso_ahead_m(self) -> float:
         """How far ahead of the middle of the soles the torso link's origin is in the default pose."""
@@ -216,6 +222,8 @@ class RobotSpec:
             if j.mirror_name not in self.joint_names:
                 raise ValueError(f"{self.name}: mirror of {j.name} is unknown: {j.mirror_name!r}")
             mirror = self.joint(j.mirror_name)
+            if j.mirror_sign not in (1.0, -1.0):
+                raise ValueError(f"{self.name}: mirror_sign of {j.name} must be 1 or -1, got {j.mirror_sign!r}")
             if (mirror.mirror_name, mirror.mirror_sign) != (j.name, j.mirror_sign):
                 raise ValueError(f"{self.name}: {j.name} and {mirror.name} are not each other's mirror with one sign")
 
@@ -223,3 +231,5 @@ class RobotSpec:
         ends = [body for arm in self.arms for body in (arm.hand_body, arm.elbow_body)] + [f.body for f in self.feet]
         for name in (self.base_body, self.torso_body, *ends, *(n for pair in self.contact_excludes for n in pair)):
             self.body(name)
+        if self._sole(self.feet[0])[1] <= self._sole(self.feet[1])[1]:
+            raise ValueError(f"{self.name}: the left foot must come first, got {self.feet[0].side!r}")
