@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +56,6 @@ def strip(source: Path, target: Path) -> dict[str, Any]:
     require_parts(source, content, KEPT)
     kept = {name: content[name] for name in KEPT}
     kept["config"] = without_folder(kept["config"], f"{Path.cwd()}/")
-    target.parent.mkdir(exist_ok=True)
     save_checkpoint(target, kept | EMPTY)
     return kept
 
@@ -75,6 +75,7 @@ def description(target: Path, content: dict[str, Any], headlines: dict[str, Any]
         "robot": content["layout"]["robot"],
         "stage": content["kind"],
         "runs": runs,
+        **({"base": config["base"]} if "base" in config else {}),
         "command": config["command"],
         "commit": config["commit"],
         "seed": config["training"]["seed"],
@@ -87,19 +88,36 @@ def description(target: Path, content: dict[str, Any], headlines: dict[str, Any]
 
 
 def publish(source: Path, name: str, envs: int) -> int:
-    """Write everything. Returns the exit status: 0, or that of the evaluation that failed."""
+    """Write everything, once all is there. Returns the exit status: 0, or that of the evaluation that failed.
+
+    Raises:
+        ValueError: the checkpoint is of another robot or stage than its name.
+    """
     target = checkpoint_path(name)
-    content = strip(source, target)
-    headlines: dict[str, Any] = {}
-    for evaluation, options in EVALUATIONS.items():
-        out = target.with_name(f"{name}.{evaluation}.json")
-        args = [str(envs) if option == ENVS else option for option in options]
-        if status := evaluate([*args, "--checkpoint", str(target), "--json", str(out)]):
-            return status
-        result = json.loads(out.read_text())
-        headlines[evaluation] = {key: result[key] for key in HEADLINE if key in result}
-    write_json(target.with_suffix(".json"), description(target, content, headlines))
+    target.parent.mkdir(exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=target.parent) as folder:
+        staged = Path(folder) / target.name
+        content = strip(source, staged)
+        require_name(name, content)
+        headlines: dict[str, Any] = {}
+        for evaluation, options in EVALUATIONS.items():
+            out = staged.with_name(f"{name}.{evaluation}.json")
+            args = [str(envs) if option == ENVS else option for option in options]
+            if status := evaluate([*args, "--checkpoint", str(staged), "--json", str(out)]):
+                return status
+            result = json.loads(out.read_text())
+            headlines[evaluation] = {key: result[key] for key in HEADLINE if key in result}
+        write_json(staged.with_suffix(".json"), description(staged, content, headlines))
+        for path in sorted(Path(folder).iterdir()):
+            path.replace(target.with_name(path.name))
     return 0
+
+
+def require_name(name: str, content: dict[str, Any]) -> None:
+    """Raise ValueError unless a checkpoint is of the robot and the stage that `name`, ROBOT-STAGE, says."""
+    robot, stage = content["layout"]["robot"], {"distill": "cotap"}.get(content["kind"], content["kind"])
+    if name != f"{robot}-{stage}":
+        raise ValueError(f"the checkpoint is of {robot}-{stage}, it cannot be published as {name}")
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -72,4 +72,11 @@ def test_what_is_no_checkpoint_of_a_run_is_refused_and_leaves_nothing(
         save_checkpoint(tmp_path / "odd.pt", content)
     assert publish.main([str(tmp_path / "odd.pt"), "h1-base"]) == 2
     assert message in capsys.readouterr().err
-    assert not package.exists()
+    assert not list(package.iterdir())
+
+
+def test_a_policy_is_published_under_its_own_name_only(tmp_path: Path, package: Path, capsys: pytest.CaptureFixture):
+    source = save_random_policy(tmp_path / "run.pt", "distill")
+    assert publish.main([str(source), "h1-base"]) == 2
+    assert "is of h1-cotap, it cannot be published as h1-base" in capsys.readouterr().err
+    assert not list(package.iterdir())

@@ -294,8 +294,7 @@ def _train(stage: str, options: BaseOptions | DistillOptions, base: dict[str, An
     training.env.seed, training.env.num_threads = training.seed, training.threads
     training.check()
     config = {"stage": stage, "training": to_plain(training), **provenance(options.command, training.env.backend)}
-    if options.resume:
-        config["earlier_runs"] = _earlier_runs(options.resume)
+    config |= _origin(options)
     training.env.seed, training.env.num_threads = ranks.seed(training.seed), ranks.threads(training.threads)
     training.device = ranks.device(training.device)
     if training.env.num_threads:
@@ -322,13 +321,24 @@ def _train(stage: str, options: BaseOptions | DistillOptions, base: dict[str, An
     return run_dir
 
 
-def _earlier_runs(checkpoint: str) -> list[dict[str, Any]]:
-    """Command, commit and last sample of every run that a checkpoint comes from, the first one first."""
-    from cotap.agents.checkpoint import load_checkpoint
+def _origin(options: BaseOptions | DistillOptions) -> dict[str, Any]:
+    """What a run's config says of where it comes from: the runs before it, and the base of a distillation."""
+    from cotap.agents.checkpoint import load_checkpoint, sha256
 
-    content = load_checkpoint(checkpoint)
+    if options.resume:
+        content = load_checkpoint(options.resume)
+        before = {"base": content["config"]["base"]} if "base" in content["config"] else {}
+        return {"earlier_runs": _runs(content), **before}
+    if isinstance(options, DistillOptions) and options.base_checkpoint:
+        content = load_checkpoint(options.base_checkpoint)
+        return {"base": {"sha256": sha256(options.base_checkpoint), "runs": _runs(content)}}
+    return {}
+
+
+def _runs(content: dict[str, Any]) -> list[dict[str, Any]]:
+    """Command, commit and last sample of every run that a checkpoint comes from, the first one first."""
     config = content["config"]
-    last = {name: config.get(name, "") for name in ("command", "commit")} | {"samples": content["samples"]}
+    last = {name: config.get(name, "") for name in ("command", "commit")} | {"samples": content.get("samples", 0)}
     return [*config.get("earlier_runs", []), last]
 
 

@@ -276,8 +276,8 @@ class DualRunner(OnPolicyRunner):
         self._saved = self.current_learning_iteration
 
     def load(self, path: str, *_: Any, map_location: str | None = None, **__: Any) -> dict:
-        """Load a checkpoint. What it lacks starts afresh: a shipped one has no optimisers and no simulator states, and
-        those of another number of envs or ranks, or of other collisions, do not fit.
+        """Load a checkpoint of a run. Simulator states that it lacks, or that are of another number of envs or ranks,
+        or of other collisions, start afresh.
 
         Args:
             path: The file.
