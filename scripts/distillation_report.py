@@ -138,7 +138,7 @@ def against_pd(runs: Runs, envs: int) -> list[str]:
     for mode, where in {"stance": [], "walking": ["--mode", "walking", "--random-direction"]}.items():
         pd = None
         for name, law in rows.items():
-            size = ["--num-envs", str(envs), "--worlds"]
+            size = ["--num-envs", str(envs), "--per-env"]
             result = runs(f"pd-{mode}-{name.replace(' ', '')}", "impact", "--motion", "none", *size, *where, *law)
             pd, m = pd or result, result["metrics_without_falls"]
             names = ("e_torso", "e_ee", "j_upper")

@@ -41,7 +41,7 @@ class Book:
         if not self.has(policy):
             return None
         size = [] if envs == 0 else ["--num-envs", str(envs or self.envs)]
-        paired = ["--worlds"] if args[0] in PAIRED else []
+        paired = ["--per-env"] if args[0] in PAIRED else []
         path = self.evaluations / f"{name}.json"
         arguments = [args[0], *size, *paired, *args[1:]]
         self.results[name] = kept_or_run(path, arguments, self.policies[policy], self.threads, self.reuse)

@@ -50,7 +50,7 @@ def test_intervals_cover_a_true_difference_at_their_rate():
 
 def with_envs(values, stood=None, seed=0):
     r = result(x=summarize(torch.tensor([v for v in values if v is not None])))
-    r["worlds"] = {"stood": [1.0] * len(values) if stood is None else stood, "x": values}
+    r["per_env"] = {"stood": [1.0] * len(values) if stood is None else stood, "x": values}
     r["settings"]["seed"] = seed
     return r
 
@@ -93,7 +93,7 @@ def test_shares_keep_their_width_and_one_env_has_none():
         ([], "stood among them"),
         ({"x": [1.0]}, "stood among them"),
         ({"stood": [1.0], "x": 1.0}, "stood among them"),
-        ({"stood": [1.0], "x": [1.0, 2.0]}, "worlds.x has 2 envs"),
+        ({"stood": [1.0], "x": [1.0, 2.0]}, "per_env.x has 2 envs"),
         ({"stood": [1.0], "x": ["1"]}, "finite numbers or null, got '1'"),
         ({"stood": [None], "x": [1.0]}, "stood must be 0 or 1, got None"),
         ({"stood": [0.5], "x": [1.0]}, "stood must be 0 or 1, got 0.5"),
@@ -101,7 +101,7 @@ def test_shares_keep_their_width_and_one_env_has_none():
 )
 def test_envs_that_are_none_are_refused(tmp_path, capsys, envs, named):
     file = tmp_path / "a.json"
-    file.write_text(json.dumps(result(x={"mean": 1.0, "ci95": [0.5, 1.5]}) | {"worlds": envs}))
+    file.write_text(json.dumps(result(x={"mean": 1.0, "ci95": [0.5, 1.5]}) | {"per_env": envs}))
     assert main([str(file), str(file)]) == 2
     assert named in capsys.readouterr().err
 

@@ -101,7 +101,7 @@ def test_only_evaluations_of_the_same_policy_and_settings_are_kept(book, monkeyp
     path = book.evaluations / "row.json"
     book.run("row", "base", "impact", "--alpha", "0.5")
     written = json.loads(path.read_text())
-    assert "--worlds" in written["arguments"]
+    assert "--per-env" in written["arguments"]
     book.reuse = True
     for changed, kept in (
         ({}, True),

@@ -58,8 +58,8 @@ def read(path: str) -> dict[str, Any]:
     for part in ("metrics", "metrics_without_falls"):
         for name, summary in content.get(part, {}).items():
             _require_summary(f"{path!r}: {part}.{name}", summary)
-    if "worlds" in content:
-        _require_envs(f"{path!r}: worlds", content["worlds"])
+    if "per_env" in content:
+        _require_envs(f"{path!r}: per_env", content["per_env"])
     return content
 
 
@@ -91,7 +91,7 @@ def _require_envs(where: str, envs: Any) -> None:
 def compare(a: dict[str, Any], b: dict[str, Any], without_falls: bool = False) -> dict[str, Any]:
     """Differences of all measures that both have, and the settings in which they differ.
 
-    Where both have every env's figures (`--worlds`) of as many envs and one seed, envs are compared one by one:
+    Where both have every env's figures (`--per-env`) of as many envs and one seed, envs are compared one by one:
     what friction, motion or direction does to a measure it does to both, and drops out. Otherwise the interval of a
     difference follows from those of its terms, taken to be independent (the square-and-add method of Zou and Donner
     2008, Newcombe's for shares).
@@ -115,12 +115,12 @@ def compare(a: dict[str, Any], b: dict[str, Any], without_falls: bool = False) -
 
 def measure_difference(a: dict[str, Any], b: dict[str, Any], name: str, without_falls: bool) -> dict[str, Any]:
     """`b - a` of one measure of two evaluations, env by env where both have them; as `difference`."""
-    old, new = (x.get("worlds", {}).get(name, []) for x in (a, b))
+    old, new = (x.get("per_env", {}).get(name, []) for x in (a, b))
     seeds = [x["settings"].get("seed") for x in (a, b)]
     paired = old and len(old) == len(new) and seeds[0] is not None and seeds[0] == seeds[1]
     # A bootstrap of shares has no width where all envs agree; Newcombe's interval has.
     if paired and not {*old, *new} <= {0.0, 1.0, None}:
-        return paired_difference(a["worlds"], b["worlds"], name, without_falls)
+        return paired_difference(a["per_env"], b["per_env"], name, without_falls)
     key = "metrics_without_falls" if without_falls else "metrics"
     return difference(a[key][name], b[key][name])
 

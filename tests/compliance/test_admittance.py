@@ -131,7 +131,7 @@ def test_the_matched_composition_splits_the_compliance(arms):
         torch.testing.assert_close(torque.stiffness, alone.stiffness)
 
 
-def test_worlds_that_begin_anew_forget(arms):
+def test_envs_that_begin_anew_forget(arms):
     force = torch.tensor([0.0, 0.0, 50.0]).expand(3, 2, 3)
     law, old = LAWS["facet"](arms, LawConfig("facet")), torch.zeros(3, dtype=torch.bool)
     for _ in range(50):

@@ -160,7 +160,7 @@ def test_hmc_adds_torques_by_weight(arms, rng):
         torch.testing.assert_close(change, 1e-3 * expected.sum(-1), atol=1e-3, rtol=1e-3)
 
 
-def test_arms_that_agree_but_for_what_worlds_vary_share_a_law():
+def test_arms_that_agree_but_for_what_envs_vary_share_a_law():
     one = LawConfig("facet", stiffness=(1.0, 2.0, 3.0), alpha=0.1)
     assert one.kind() == LawConfig("facet").kind()
     for other in (LawConfig("dcc"), LawConfig("facet", virtual_mass=2.0), LawConfig("facet", sensing="estimated")):

@@ -259,7 +259,7 @@ def test_the_command_writes_what_was_asked_for(protocol, checkpoint, tmp_path, c
     assert (tmp_path / "plot.png").stat().st_size > 5000
     assert result["metrics"]["j_upper_blow"]["n"] == 16
     assert ("load_overshoot" in result["metrics"]) == (protocol == "constant-load")
-    assert "worlds" not in result
+    assert "per_env" not in result
     assert "| e_ee_hit |" in capsys.readouterr().out
 
 
@@ -274,15 +274,15 @@ def test_the_blow_itself_is_the_first_tenth_of_a_second():
 
 
 def test_every_envs_figures_are_those_behind_the_means():
-    protocol = Impact(num_envs=3, worlds=True)
+    protocol = Impact(num_envs=3, per_env=True)
     t = trajectory(steps=200, envs=3)
     t.hand_error[:] = torch.tensor([0.1, 0.2, 0.4])[:, None]
     t.fell[150, 2] = True
     env = HumanoidEnv(protocol.configure(HumanoidEnvConfig(num_threads=1)))
     result = protocol.measure(t, env)
-    assert result["worlds"]["stood"] == [1.0, 1.0, 0.0]
-    assert result["worlds"]["e_ee_hit"] == pytest.approx([0.1, 0.2, 0.4])
-    assert result["worlds"]["recovery_s"][2] is None
+    assert result["per_env"]["stood"] == [1.0, 1.0, 0.0]
+    assert result["per_env"]["e_ee_hit"] == pytest.approx([0.1, 0.2, 0.4])
+    assert result["per_env"]["recovery_s"][2] is None
     assert result["metrics"]["e_ee_hit"]["mean"] == pytest.approx(0.7 / 3.0)
     assert result["metrics_without_falls"]["e_ee_hit"]["mean"] == pytest.approx(0.15)
 

@@ -281,7 +281,7 @@ def test_what_cannot_be_measured_is_null_with_a_reason():
     json.dumps(s, allow_nan=False)
 
 
-def test_path_error_is_of_worlds_that_follow_a_path():
+def test_path_error_is_of_envs_that_follow_a_path():
     t = trajectory()
     t.path_error[:, 0] = 0.2
     t.path_error[100:, 0] = 0.4

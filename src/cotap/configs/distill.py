@@ -34,7 +34,7 @@ def default(base: BaseTraining) -> DistillTraining:
     env.upper_body = UpperBodyConfig(
         left=LawConfig(name="cotap"), right=LawConfig(name="cotap"), sampling=LawSampling(enabled=True, full_alpha=0.25)
     )
-    _after_base(training)
+    _after_base(training, base)
     env.rewards.upper.reference_closeness = 1.0
     training.runner.iterations = 6103
     return training
@@ -51,12 +51,13 @@ def paper(base: BaseTraining) -> DistillTraining:
     return training
 
 
-def _after_base(training: DistillTraining) -> None:
+def _after_base(training: DistillTraining, base: BaseTraining) -> None:
     """What the base has learned is there from the start, and exploration goes on from where the base's ended."""
     env = training.env
     env.assist = AssistConfig()
     env.forces.pushes.ramp, env.forces.hand_loads.ramp = RampConfig(), RampConfig()
-    training.ppo.initial_std = training.ppo.least_std
+    halvings = base.runner.iterations / base.ppo.std_half_life
+    training.ppo.initial_std = max(base.ppo.least_std, base.ppo.initial_std * 0.5**halvings)
 
 
 def without_ratio(base: BaseTraining) -> DistillTraining:

@@ -52,7 +52,7 @@ class Impact(Scenario):
     """Falls count up to this long after the onset [s]."""
     episode_seconds: float = 4.0
     """Length of the evaluation [s]."""
-    worlds: bool = False
+    per_env: bool = False
     """Write every env's figures as well: `python -m cotap.compare` then compares env by env."""
 
     def check(self) -> None:
@@ -113,7 +113,7 @@ class Impact(Scenario):
                 "window": {"start": 0.0, "end": self.seconds},
             },
             "curve": curve(t, onset, hit),
-            **({"worlds": per_world(window, stood)} if self.worlds else {}),
+            **({"per_env": per_env_figures(window, stood)} if self.per_env else {}),
         } | self._stiffness(env, window, stood)
 
     def _stiffness(self, env: HumanoidEnv, measures: dict[str, torch.Tensor], stood: torch.Tensor) -> dict[str, Any]:
@@ -208,7 +208,7 @@ def window_measures(t: Trajectory, begin: int, end: int, hit: list[int]) -> dict
     }
 
 
-def per_world(measures: dict[str, torch.Tensor], stood: torch.Tensor) -> dict[str, list[float | None]]:
+def per_env_figures(measures: dict[str, torch.Tensor], stood: torch.Tensor) -> dict[str, list[float | None]]:
     """Measures (N,) env by env, to six digits, null where an env has none; and whether it `stood` to the end."""
 
     def plain(value: float) -> float | None:

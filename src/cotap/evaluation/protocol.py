@@ -11,6 +11,7 @@ import torch
 
 from cotap.checks import require_one_of, require_positive_int, require_range, require_seed
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
+from cotap.envs.randomization import RandomizationConfig
 from cotap.envs.terminations import TerminationConfig
 from cotap.evaluation import report
 from cotap.evaluation.law_options import LawOptions
@@ -106,7 +107,7 @@ class RolloutProtocol(Protocol):
     def configure(self, env_cfg: HumanoidEnvConfig) -> HumanoidEnvConfig:
         """Turn the environment that a policy was trained in into this protocol's. Changes and returns `env_cfg`."""
         super().configure(env_cfg)
-        env_cfg.randomization.enabled = self.randomize
+        env_cfg.randomization = RandomizationConfig(enabled=self.randomize)
         select_motion(env_cfg.motions.clips, self.motion, self.library)
         return env_cfg
 
