@@ -11,6 +11,9 @@ from __future__ import annotations
 
 # MuJoCo's extension module has no type stubs.
 # pyright: reportAttributeAccessIssue=false
+import cotap  # noqa: F401 - before torch, which reads when it is loaded for how long its threads may spin
+
+# isort: split
 import argparse
 import os
 import platform
