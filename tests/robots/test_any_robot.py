@@ -108,14 +108,16 @@ def test_default_pose_has_its_soles_on_the_floor_and_the_torso_at_its_height(any
 
 
 def test_a_bent_waist_counts_in_the_base_height():
-    spec = with_defaults(made_up(), waist_yaw=0.7, waist_roll=0.5)
+    roll_pitches = {"waist_roll": {"axis": (0.0, 1.0, 0.0), "mirror_sign": 1.0, "default_rad": 0.5}}
+    joints = tuple(dataclasses.replace(j, **roll_pitches.get(j.name, {})) for j in made_up().joints)
+    spec = dataclasses.replace(made_up(), joints=joints)
     data = posed(build_model(spec), default_angles(spec), spec.base_height_m)
     assert data.body(spec.torso_body).xpos[2] == pytest.approx(spec.nominal_height_m, abs=1e-9)
     assert abs(spec.base_height_m - made_up().base_height_m) > 1e-3
 
 
 def test_soles_of_spread_legs_are_as_far_apart_as_mujocos():
-    spec = with_defaults(made_up(), left_hip_roll=0.3, right_hip_roll=-0.4)
+    spec = with_defaults(made_up(), left_hip_roll=0.4, right_hip_roll=-0.4)
     data = posed(build_model(spec), default_angles(spec))
     distance = data.site("left_foot").xpos[1] - data.site("right_foot").xpos[1]
     assert spec.sole_distance_m == pytest.approx(distance, abs=1e-9)

@@ -55,6 +55,21 @@ def test_a_mirror_sign_is_a_sign(any_spec):
         changed(any_spec, any_spec.joints[0].name, mirror_sign=0.5)
 
 
+def test_the_default_pose_is_its_own_mirror_image(any_spec):
+    first = any_spec.joints[0]
+    message = rf"must be its own mirror image; {first.name} has 0\.3 rad and {first.mirror_name} \S+ rad"
+    with pytest.raises(ValueError, match=message):
+        changed(any_spec, first.name, default_rad=0.3)
+    middle = next(j for j in any_spec.joints if j.mirror_name == j.name and j.mirror_sign < 0)
+    with pytest.raises(ValueError, match=f"{middle.name} has 0.1 rad .* sign -1"):
+        changed(any_spec, middle.name, default_rad=0.1)
+
+
+def test_base_and_torso_are_two_bodies(any_spec):
+    with pytest.raises(ValueError, match="base and torso must be two bodies"):
+        dataclasses.replace(any_spec, torso_body=any_spec.base_body)
+
+
 def test_the_left_foot_comes_first(any_spec):
     with pytest.raises(ValueError, match="the left foot must come first, got 'right'"):
         dataclasses.replace(any_spec, feet=any_spec.feet[::-1])

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
+
+import tyro
 
 from cotap.checks import require_one_of, require_positive_int, require_range, require_seed
 from cotap.envs.actions import ActionConfig
@@ -38,12 +41,12 @@ class HumanoidEnvConfig:
     """Name of the robot."""
     num_envs: int = 2048
     """Number of envs."""
-    seed: int = 0
-    """Seed of the environment's own random numbers."""
+    seed: Annotated[int, tyro.conf.Suppress] = 0
+    """Seed of the environment's own random numbers. A training sets it, as it does the threads."""
     backend: str = "auto"
     """What simulates: mjbatch (the CPU), warp (MuJoCo Warp; a GPU if there is one), or auto: warp where there are a GPU
     and the extra `warp`, else mjbatch."""
-    num_threads: int = 0
+    num_threads: Annotated[int, tyro.conf.Suppress] = 0
     """Physics threads of mjbatch; 0 takes every core."""
     collision: str = "full"
     """full (all shapes, against the floor and each other) or feet (only feet meet the floor)."""

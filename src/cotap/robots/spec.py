@@ -98,7 +98,8 @@ class RobotSpec:
     visits the bodies, depth first, so that `qpos[7:]` is joint by joint the same.
 
     Raises:
-        ValueError: joints are out of order, a name is unknown, mirrors disagree, or arms differ in length.
+        ValueError: joints are out of order, a name is unknown, mirrors or their defaults disagree, base and torso are
+            one body, or arms differ in length.
     """
 
     name: str
@@ -226,8 +227,15 @@ class RobotSpec:
                 raise ValueError(f"{self.name}: mirror_sign of {j.name} must be 1 or -1, got {j.mirror_sign!r}")
             if (mirror.mirror_name, mirror.mirror_sign) != (j.name, j.mirror_sign):
                 raise ValueError(f"{self.name}: {j.name} and {mirror.name} are not each other's mirror with one sign")
+            if j.default_rad != j.mirror_sign * mirror.default_rad:
+                raise ValueError(
+                    f"{self.name}: the default pose must be its own mirror image; {j.name} has {j.default_rad:g} rad "
+                    f"and {mirror.name} {mirror.default_rad:g} rad, with sign {j.mirror_sign:g}"
+                )
 
     def _check_bodies(self) -> None:
+        if self.base_body == self.torso_body:
+            raise ValueError(f"{self.name}: base and torso must be two bodies, got {self.base_body!r} for both")
         ends = [body for arm in self.arms for body in (arm.hand_body, arm.elbow_body)] + [f.body for f in self.feet]
         for name in (self.base_body, self.torso_body, *ends, *(n for pair in self.contact_excludes for n in pair)):
             self.body(name)
