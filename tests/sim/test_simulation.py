@@ -102,8 +102,7 @@ def test_masses_differ_in_effect_between_envs():
     sim.field("body_mass")[1, 1] = 8.0
     sim.field("body_inertia")[1, 1] *= 4.0
     sim.update_constants()
-    zero = torch.zeros(2, 3)
-    sim.apply_force(1, torch.tensor([[4.0, 0.0, 0.0]]).repeat(2, 1), zero)
+    sim.xfrc[:, 1, 0] = 4.0
     sim.step(lambda _: torch.zeros(2, 0))
     np.testing.assert_allclose(sim.qvel[:, 0], [4 / 2 * 0.01, 4 / 8 * 0.01])
 
@@ -141,8 +140,8 @@ def test_undeclared_fields_are_refused(sim):
         sim.field("actuator_gear")
 
 
-def test_a_force_at_the_hand_is_mj_apply_ft(model, rng):
-    """Acceleration and motion are those of the generalised force that MuJoCo itself computes for the point."""
+def test_a_wrench_at_the_centre_of_mass_is_mj_apply_ft(model, rng):
+    """A force at the hand with its moment moves the robot as the generalised force that MuJoCo computes for the point."""
     sim = BatchSimulation(model, N, 1, 1)
     qpos, qvel = start(model)
     qpos[:, 3:7] = torch.nn.functional.normalize(torch.randn(N, 4, generator=rng), dim=1)
@@ -162,7 +161,8 @@ def test_a_force_at_the_hand_is_mj_apply_ft(model, rng):
         data.qfrc_applied[:] = generalised
         mujoco.mj_step(model, data)
         references.append(data.qvel.copy())
-    sim.apply_force(body, force, torch.tensor(np.array(levers), dtype=torch.float32))
+    sim.xfrc[:, body, :3] = force
+    sim.xfrc[:, body, 3:] = torch.linalg.cross(torch.tensor(np.array(levers), dtype=torch.float32), force)
     sim.step(no_drive(sim))
     np.testing.assert_allclose(sim.qvel, references, atol=1e-4)
     assert np.abs(references).max() > 1.0

@@ -60,13 +60,14 @@ def test_joints_agree_without_contact(spec, rng):
     gain = torch.tensor([j.kp for j in spec.joints])
     targets = 0.3 * torch.randn(50, 2, N, model.nu, generator=rng)
     force = 20.0 * torch.randn(N, 3, generator=rng)
+    wrench = torch.cat((force, torch.linalg.cross(torch.full((N, 3), 0.1), force)), 1)
     seen = []
     for sim in both(model):
         vary(sim, torch.Generator().manual_seed(1))
         sim.reset(everyone(), qpos, qvel)
         rows = []
         for step in range(50):
-            sim.apply_force(model.body("left_elbow_link").id, force, torch.full((N, 3), 0.1))
+            sim.xfrc[:, model.body("left_elbow_link").id] = wrench
             sim.step(lambda k, step=step: gain * targets[step, k])
             rows.append(sim.qpos[:, 7:].double().clone())
         seen.append(torch.stack(rows))
@@ -159,8 +160,7 @@ def test_one_backend_goes_on_from_the_other(model, rng, forwards):
     a, b = sims if forwards else sims[::-1]
     vary(a, rng)
     a.reset(everyone(), *start(model, 1.5, rng))
-    force = torch.tensor([[5.0, -3.0, 2.0]]).repeat(N, 1)
-    a.apply_force(1, force, torch.zeros(N, 3))
+    a.xfrc[:, 1, :3] = torch.tensor([5.0, -3.0, 2.0])
     a.step(lambda _: torch.ones(N, model.nu))
     b.restore(a.snapshot())
     for sim in sims:

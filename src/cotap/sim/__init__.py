@@ -1,4 +1,4 @@
-"""Batched physics: stepping, per-world model fields, wrenches, snapshots; knows nothing of control laws."""
+"""Batched physics: stepping, per-env model fields, wrenches, snapshots; knows nothing of control laws."""
 
 from cotap.sim.backends import BACKENDS, make_simulation, resolve_backend
 from cotap.sim.batch_simulation import BatchSimulation

@@ -37,7 +37,7 @@ def make_simulation(
     backend: str, model: mujoco.MjModel, num_envs: int, substeps: int, num_threads: int = 0,
     fields: tuple[str, ...] = (),
 ) -> Simulation:  # fmt: skip
-    """N worlds of `model` on a backend. Warp takes torch's present graphics card, or without one the processor.
+    """N envs of `model` on a backend. Warp takes torch's present graphics card, or without one the processor.
 
     Raises:
         ValueError: the backend is unknown or not installed, or a number is out of its range.

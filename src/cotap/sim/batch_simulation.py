@@ -16,10 +16,10 @@ class BatchSimulation(Simulation):
 
     Args:
         model: Compiled model; copied.
-        num_envs: Number of worlds.
+        num_envs: Number of envs.
         substeps: Physics steps per control step.
         num_threads: Worker threads; 0 takes every processor.
-        fields: Names of `mjModel` fields that are to differ between worlds.
+        fields: Names of `mjModel` fields that are to differ between envs.
     """
 
     def __init__(
@@ -36,7 +36,7 @@ class BatchSimulation(Simulation):
         self._fields = {name: torch.from_numpy(self._batch.expand(name)) for name in fields}
 
     def update_constants(self) -> None:
-        """Recompute what MuJoCo derives from masses and inertias, per world. Call after writing such fields."""
+        """Recompute what MuJoCo derives from masses and inertias, per env. Call after writing such fields."""
         self._batch.set_const()
 
     def _advance(self) -> None:

@@ -1,4 +1,4 @@
-"""A batch of MuJoCo worlds as torch tensors that share the simulator's memory: what every backend has in common."""
+"""A batch of simulated robots (envs) as torch tensors that share the simulator's memory: what every backend has in common."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ DriveFunction = Callable[[int], torch.Tensor]
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Everything that the worlds' future depends on: integration states, sensors, expanded model fields.
+    """Everything that the envs' future depends on: integration states, sensors, expanded model fields.
 
     States are in the order of MuJoCo's mjSTATE_INTEGRATION whatever the backend, so that one may go on from another's.
     """
@@ -30,7 +30,7 @@ class Snapshot:
 
 
 class Simulation(ABC):
-    """N worlds of one model.
+    """N envs of one model.
 
     State tensors (`qpos`, `qvel`, `ctrl`, `xfrc`) are views into the simulator's own memory, in its own precision:
     write to them and the next step starts from there. So are the tensors of `field`. `sensors` (float32) is to be read.
@@ -40,7 +40,7 @@ class Simulation(ABC):
 
     Args:
         model: Compiled model; copied.
-        num_envs: Number of worlds.
+        num_envs: Number of envs.
         substeps: Physics steps per control step.
     """
 
@@ -65,7 +65,7 @@ class Simulation(ABC):
         self.dt = float(model.opt.timestep) * substeps
 
     def field(self, name: str) -> torch.Tensor:
-        """Per-world values of an `mjModel` field named at construction, (num_envs, ...), to write in place.
+        """Per-env values of an `mjModel` field named at construction, (num_envs, ...), to write in place.
 
         Raises:
             ValueError: the field was not declared.
@@ -81,16 +81,16 @@ class Simulation(ABC):
 
     @abstractmethod
     def update_constants(self) -> None:
-        """Recompute what MuJoCo derives from masses and inertias, per world. Call after writing such fields."""
+        """Recompute what MuJoCo derives from masses and inertias, per env. Call after writing such fields."""
 
     def step(self, drive: DriveFunction) -> None:
-        """Advance every world by one control step, asking `drive` for `ctrl` before every physics step."""
+        """Advance every env by one control step, asking `drive` for `ctrl` before every physics step."""
         for k in range(self.substeps):
             self.ctrl.copy_(drive(k))
             self._advance()
 
     def reset(self, mask: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
-        """Restart the worlds in `mask` (num_envs,) bool from `qpos` (n, nq) and `qvel` (n, nv), n = mask.sum().
+        """Restart the envs in `mask` (num_envs,) bool from `qpos` (n, nq) and `qvel` (n, nv), n = mask.sum().
 
         Forces and controls are cleared; sensors are current afterwards.
         """
@@ -101,14 +101,6 @@ class Simulation(ABC):
         self._clear(mask)
         self.qpos[ids], self.qvel[ids] = qpos.to(self.qpos), qvel.to(self.qvel)
         self._forward(mask)
-
-    def apply_force(self, body: int, force_w: torch.Tensor, lever_w: torch.Tensor) -> None:
-        """Apply `force_w` (num_envs, 3) [N] to body number `body` at `lever_w` from its centre of mass, world frame.
-
-        MuJoCo takes a wrench at the centre of mass, so the force's moment is added here. Replaces the body's wrench.
-        """
-        self.xfrc[:, body, :3] = force_w
-        self.xfrc[:, body, 3:] = torch.linalg.cross(lever_w, force_w)
 
     def snapshot(self) -> Snapshot:
         """Copy of everything that the future depends on."""
@@ -138,15 +130,15 @@ class Simulation(ABC):
 
     @abstractmethod
     def _advance(self) -> None:
-        """One physics step of every world."""
+        """One physics step of every env."""
 
     @abstractmethod
     def _clear(self, mask: torch.Tensor) -> None:
-        """Put the worlds of `mask` (num_envs,) back to the model's initial state, without forces and controls."""
+        """Put the envs of `mask` (num_envs,) back to the model's initial state, without forces and controls."""
 
     @abstractmethod
     def _forward(self, mask: torch.Tensor) -> None:
-        """Make everything that follows from the state current in the worlds of `mask` (num_envs,), and in no other."""
+        """Make everything that follows from the state current in the envs of `mask` (num_envs,), and in no other."""
 
     @abstractmethod
     def _read_state(self) -> torch.Tensor:
@@ -158,5 +150,5 @@ class Simulation(ABC):
 
 
 def state_size(model: mujoco.MjModel) -> int:
-    """Numbers in a world's integration state."""
+    """Numbers in an env's integration state."""
     return mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_INTEGRATION)

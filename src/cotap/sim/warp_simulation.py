@@ -16,7 +16,7 @@ from cotap.sim.simulation import Simulation, state_size
 _CONTACTS_PER_GEOM, _ON_BUMPS = 4, 16
 """Contacts for which there is room, per geom that may touch anything: on a plane, and on a height field."""
 _DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "actuator_acc0")
-"""What MuJoCo derives from masses and inertias; of `_SOURCES`, per world as well."""
+"""What MuJoCo derives from masses and inertias; of `_SOURCES`, per env as well."""
 _SOURCES = {"body_mass", "body_inertia"}
 _INTEGRATION = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
@@ -25,15 +25,15 @@ class WarpSimulation(Simulation):
     """`Simulation` on MuJoCo Warp. States are float32 views of Warp's arrays; nothing travels through the host.
 
     The physics is MuJoCo's: the same integrator (implicitfast), solver (Newton) and friction cone (pyramidal), in
-    float32, its tolerance no less than 1e-6. Warp has no automatic reset of worlds that diverge, so none is switched
+    float32, its tolerance no less than 1e-6. Warp has no automatic reset of envs that diverge, so none is switched
     off.
 
     Args:
         model: Compiled model; copied.
-        num_envs: Number of worlds.
+        num_envs: Number of envs.
         substeps: Physics steps per control step.
         device: Where they are: "cpu" (to develop and test), or "cuda" with or without a card's number.
-        fields: Names of `mjModel` fields that are to differ between worlds.
+        fields: Names of `mjModel` fields that are to differ between envs.
 
     Raises:
         ValueError: Warp knows no such device.
@@ -62,7 +62,7 @@ class WarpSimulation(Simulation):
         self._graph = self._capture()
 
     def update_constants(self) -> None:
-        """Recompute what MuJoCo derives from masses and inertias, per world. Call after writing such fields."""
+        """Recompute what MuJoCo derives from masses and inertias, per env. Call after writing such fields."""
         with wp.ScopedDevice(self._place):
             mjw.set_const(self._model, self._data)
 
@@ -91,7 +91,7 @@ class WarpSimulation(Simulation):
             mjw.reset_data(self._model, self._data, wp.from_torch(mask))
 
     def _forward(self, mask: torch.Tensor) -> None:
-        # Warp moves all worlds forward; what others had of the step before is put back.
+        # Warp moves all envs forward; what others had of the step before is put back.
         kept = [(tensor, tensor.clone()) for tensor in (self.sensors, self._warm_start)]
         with wp.ScopedDevice(self._place):
             mjw.forward(self._model, self._data)
@@ -128,6 +128,6 @@ def _supported(model: mujoco.MjModel) -> mujoco.MjModel:
 
 
 def _room_for_contacts(model: mujoco.MjModel) -> int:
-    """Contacts per world for which memory is set aside."""
+    """Contacts per env for which memory is set aside."""
     touching = int(((model.geom_contype | model.geom_conaffinity) != 0).sum())
     return (_ON_BUMPS if model.nhfield else _CONTACTS_PER_GEOM) * touching
