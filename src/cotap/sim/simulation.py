@@ -1,4 +1,4 @@
-"""A batch of simulated robots (envs) as torch tensors that share the simulator's memory: what every backend has in common."""
+"""A batch of simulated robots (envs) as torch tensors on the simulator's memory: what every backend has in common."""
 
 from __future__ import annotations
 
