@@ -141,7 +141,7 @@ def test_undeclared_fields_are_refused(sim):
 
 
 def test_a_wrench_at_the_centre_of_mass_is_mj_apply_ft(model, rng):
-    """A force at the hand with its moment moves the robot as the generalised force that MuJoCo computes for the point."""
+    """A force at the hand, with its moment, moves the robot as the generalised force that MuJoCo computes does."""
     sim = BatchSimulation(model, N, 1, 1)
     qpos, qvel = start(model)
     qpos[:, 3:7] = torch.nn.functional.normalize(torch.randn(N, 4, generator=rng), dim=1)

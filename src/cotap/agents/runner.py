@@ -290,27 +290,19 @@ class DualRunner(OnPolicyRunner):
         require_parts(path, content, PARTS.keys() - {"agents", "kind"})
         env: Any = self.env
         take_over(path, content, self.alg.model, env)
-        fresh: list[str] = []
         try:
-            if content["learner"]:
-                self.alg.load_state_dict(content["learner"])
-                self.current_learning_iteration = content["iteration"]
-                self.wall_seconds = float(content["wall_seconds"])
-            else:
-                self.alg.begin_anew()
-                fresh.append("optimisers")
+            self.alg.load_state_dict(content["learner"])
+            self.current_learning_iteration = content["iteration"]
+            self.wall_seconds = float(content["wall_seconds"])
             mine = self._share_of(content)
-            if content["learner"]:
-                self._take_random_state(mine)
+            self._take_random_state(mine)
             if self._are_ours(mine["env"], content["config"]):
                 env.load_state_dict(mine["env"])
             else:
                 env.samples = content["samples"]
-                fresh.append("simulator states")
+                say(f"{path}: no simulator states for this run; starting those afresh")
         except MALFORMED as error:
             raise CheckpointError(f"checkpoint {path!r} has states that do not fit this run: {error}") from error
-        if fresh:
-            say(f"{path}: no {' and '.join(fresh)} for this run; starting those afresh")
         return content.get("infos", {})
 
     def _share_of(self, content: dict[str, Any]) -> dict[str, Any]:
