@@ -23,16 +23,16 @@ from cotap.envs.path_following import PathFollower
 from cotap.envs.randomization import Randomizer
 from cotap.envs.record import Recorder, step_log
 from cotap.envs.rewards import RewardGroup, StepRecord
+from cotap.envs.saved_state import env_state, restore_env
 from cotap.envs.start import start_state
 from cotap.envs.state import RobotState, StateReader
 from cotap.envs.terminations import diverged, fallen
 from cotap.envs.upper_body import UpperBody
 from cotap.motions.reference import ReferenceMotion
-from cotap.persistence import on_processor, restored
 from cotap.reflection import Symmetry
 from cotap.robots import ROBOTS
 from cotap.robots.mjcf import build_model
-from cotap.sim import Snapshot, make_simulation
+from cotap.sim import make_simulation
 
 
 class HumanoidEnv(VecEnv):
@@ -284,35 +284,12 @@ class HumanoidEnv(VecEnv):
             return self.upper_body.stiffness
         return torch.diag_embed(self.reader.arm_joints(self.randomizer.gains()[0]))
 
-    def _parts(self) -> dict[str, Any]:
-        own = ("commands", "motions", "path", "upper_body", "randomizer", "actuation", "observer", "recorder")
-        return {name: getattr(self, name) for name in own} | self.forces.parts
-
     def state_dict(self) -> dict[str, Any]:
         """All that the environment's future depends on, on the CPU whatever the device."""
-        return on_processor({
-            "sim": vars(self.sim.snapshot()),
-            "parts": {name: part.state_dict() for name, part in self._parts().items()},
-            "episode_length": self.episode_length_buf.clone(),
-            "torque": self.torque,
-            "observations": dict(self._observations.items()),
-            "counters": {"samples": self.samples, "num_diverged": self.num_diverged},
-            "rng": self.rng.get_state(),
-        })  # fmt: skip
+        return env_state(self)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on exactly where `state_dict` was taken; on another kind of device or with another backend, with its own
         arithmetic and random numbers. Raises ValueError for another number of envs."""
-        self.sim.restore(Snapshot(**state["sim"]))
-        for name, part in self._parts().items():
-            part.load_state_dict(state["parts"][name])
-        self.episode_length_buf = restored("episode_length", state["episode_length"], self.episode_length_buf)
-        self.torque = restored("torque", state["torque"], self.torque)
-        present = {k: cast(torch.Tensor, v) for k, v in self._observations.items()}
-        saved = {k: restored(f"observations.{k}", state["observations"][k], v) for k, v in present.items()}
-        self._observations = TensorDict(cast(Any, saved), batch_size=[self.num_envs])
-        self.samples = state["counters"]["samples"]
-        self.num_diverged = state["counters"]["num_diverged"]
-        if state["rng"].shape == self.rng.get_state().shape:
-            self.rng.set_state(state["rng"].cpu())
+        self._observations = restore_env(self, state)
         self.state = self.reader.read()
