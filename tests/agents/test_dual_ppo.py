@@ -132,21 +132,22 @@ def test_log_probabilities_are_each_agents_own_slice():
 
 
 def test_a_time_out_pays_what_the_critic_expected_and_a_fall_does_not():
-    learner = make_learner(num_envs=3, steps=1, gamma=0.9, mini_batches=1)
+    learner = make_learner(num_envs=3, steps=1, gamma=0.9, upper_gamma=0.5, mini_batches=1)
     learner.act(random_observations(3, torch.Generator().manual_seed(0)))
     learner.rollout.values[0] = torch.tensor([[1.0, 10.0], [2.0, 20.0], [3.0, 30.0]])
     rewards = torch.tensor([[0.5, 0.25], [0.5, 0.25], [0.5, 0.25]])
     # World 0 goes on, env 1 falls, env 2 runs out of time.
     learner.process_step(rewards, torch.tensor([False, True, True]), torch.tensor([False, False, True]))
     torch.testing.assert_close(
-        learner.rollout.rewards[0], torch.tensor([[0.5, 0.25], [0.5, 0.25], [0.5 + 0.9 * 3.0, 0.25 + 0.9 * 30.0]])
+        learner.rollout.rewards[0], torch.tensor([[0.5, 0.25], [0.5, 0.25], [0.5 + 0.9 * 3.0, 0.25 + 0.5 * 30.0]])
     )
     observations = random_observations(3, torch.Generator().manual_seed(1))
     learner.compute_returns(observations)
     normalized = learner.model.normalize(observations)
     critic_input = torch.cat([normalized[g] for g in CRITIC_GROUPS], 1)
     last = torch.cat([learner.model.critics[name](critic_input) for name in AGENTS], 1).detach()
-    expected = torch.stack([rewards[0] + 0.9 * last[0], rewards[1], torch.tensor([3.2, 27.25])])
+    discounted = torch.tensor([0.9, 0.5]) * last[0]
+    expected = torch.stack([rewards[0] + discounted, rewards[1], torch.tensor([3.2, 15.25])])
     torch.testing.assert_close(learner.rollout.returns[0], expected)
 
 
@@ -252,8 +253,9 @@ def test_both_agents_reach_their_own_targets_in_a_few_updates():
     torch.manual_seed(0)
     env = DummyEnv(num_envs=128)
     cfg = DualPPOConfig(
-        hidden=(16,), steps=8, epochs=5, mini_batches=4, precision="fp32", learning_rate=3e-3, entropy=0.0, gamma=0.5
-    )
+        hidden=(16,), steps=8, epochs=5, mini_batches=4, precision="fp32", learning_rate=3e-3, entropy=0.0, gamma=0.5,
+        upper_gamma=0.5,
+    )  # fmt: skip
     learner = DualPPO(layout_of(env), env.num_envs, cfg)
 
     def error() -> torch.Tensor:
@@ -382,6 +384,7 @@ BAD = [
     ("hidden", (8, 0), r"ppo.hidden\[1\] must be a positive integer, got 0"),
     ("gamma", NAN, "ppo.gamma must be a finite number, got nan"),
     ("gamma", 1.01, r"ppo.gamma must lie in \[0.0, 1.0\], got 1.01"),
+    ("upper_gamma", -0.1, r"ppo.upper_gamma must lie in \[0.0, 1.0\], got -0.1"),
     ("lam", -0.1, r"ppo.lam must lie in \[0.0, 1.0\], got -0.1"),
     ("lam", NAN, "ppo.lam must be a finite number, got nan"),
     ("clip", 0.0, "ppo.clip must lie in .*, got 0.0"),

@@ -146,6 +146,15 @@ def test_advantages_agree_with_their_definition_as_a_sum(rng):
                 assert float(result[t, w, a]) == pytest.approx(total, abs=1e-12)
 
 
+def test_each_agent_may_have_a_discount_of_its_own(rng):
+    rewards, values, last = draw(rng, 6, 4, 2), draw(rng, 6, 4, 2), draw(rng, 4, 2)
+    dones = torch.rand(6, 4, 1, generator=rng) < 0.25
+    both = generalized_advantages(rewards, values, last, dones, torch.tensor([0.99, 0.5], dtype=torch.float64), 0.9)
+    for a, gamma in enumerate((0.99, 0.5)):
+        alone = generalized_advantages(rewards[..., a], values[..., a], last[..., a], dones[..., 0], gamma, 0.9)
+        torch.testing.assert_close(both[..., a], alone)
+
+
 def test_advantages_with_full_trace_are_discounted_returns_less_the_value(rng):
     rewards, values, last = draw(rng, 5, 3), draw(rng, 5, 3), draw(rng, 3)
     result = generalized_advantages(rewards, values, last, torch.zeros(5, 3, dtype=torch.bool), 0.9, 1.0)

@@ -44,6 +44,9 @@ BASE = {
     "env.rewards.upper.reference_closeness": 0.0,
     "ppo.hidden": (512, 256, 128),
     "ppo.symmetric": False,
+    # FALCON's: one discount.
+    "ppo.gamma": 0.99,
+    "ppo.upper_gamma": 0.99,
     "runner.iterations": 20_000,
 }
 DISTILL = {

@@ -28,7 +28,7 @@ from cotap.checks import require_one_of, require_positive_int, require_range, re
 
 @dataclass
 class DualPPOConfig:
-    """Hyperparameters, the same for both agents."""
+    """Hyperparameters, the same for both agents but for the discount."""
 
     hidden: tuple[int, ...] = (256, 128, 64)
     """Hidden layers of every actor and critic."""
@@ -46,6 +46,8 @@ class DualPPOConfig:
     """Parts that each pass is cut into."""
     gamma: float = 0.99
     """Discount."""
+    upper_gamma: float = 0.9
+    """Discount of the agent `upper`: arms answer within a tenth of a second, and what happens later is noise to it."""
     lam: float = 0.95
     """Trace decay of the advantage estimates."""
     clip: float = 0.2
@@ -79,8 +81,8 @@ class DualPPOConfig:
             raise ValueError("ppo.hidden must name at least one layer, got ()")
         for i, width in enumerate(self.hidden):
             require_positive_int(f"ppo.hidden[{i}]", width)
-        require_range("ppo.gamma", self.gamma, 0.0, 1.0)
-        require_range("ppo.lam", self.lam, 0.0, 1.0)
+        for name in ("gamma", "upper_gamma", "lam"):
+            require_range(f"ppo.{name}", getattr(self, name), 0.0, 1.0)
         for name in (
             "initial_std",
             "least_std",
@@ -133,6 +135,8 @@ class DualPPO:
         self.dtype = resolve_precision(cfg.precision, device)
         self.names = tuple(layout.action_slices)
         self.model = DualActorCritic(layout, cfg.hidden, cfg.initial_std).to(device)
+        discounts = [cfg.upper_gamma if name == "upper" else cfg.gamma for name in self.names]
+        self._discount = torch.tensor(discounts, device=device)
         self.learning_rates = dict.fromkeys(self.names, cfg.learning_rate)
         self.optimizers = {
             name: torch.optim.Adam(
@@ -200,7 +204,7 @@ class DualPPO:
     def process_step(self, group_rewards: torch.Tensor, dones: torch.Tensor, time_outs: torch.Tensor) -> None:
         """Record rewards (N, G), dones (N,) and time-outs (N,); the value stands in for what a time-out cut off."""
         t, r = self._step, self.rollout
-        r.rewards[t] = group_rewards + self.cfg.gamma * r.values[t] * time_outs.unsqueeze(1)
+        r.rewards[t] = group_rewards + self._discount * r.values[t] * time_outs.unsqueeze(1)
         r.dones[t] = dones.unsqueeze(1)
         self._step += 1
 
@@ -211,7 +215,7 @@ class DualPPO:
         with self._autocast():
             x = model.read("critic", {g: v.to(self.dtype) for g, v in model.normalize(observations).items()})
             last = torch.cat([model.critics[n](x) for n in self.names], -1)
-        advantages = generalized_advantages(r.rewards, r.values, last, r.dones, self.cfg.gamma, self.cfg.lam)
+        advantages = generalized_advantages(r.rewards, r.values, last, r.dones, self._discount, self.cfg.lam)
         r.returns = advantages + r.values
         r.advantages = self.ranks.standardize(advantages.flatten(0, 1)).unflatten(0, advantages.shape[:2])
         self._step = 0

@@ -44,8 +44,9 @@ def clipped_value_loss(value: torch.Tensor, old_value: torch.Tensor, target: tor
 
 
 def generalized_advantages(
-    rewards: torch.Tensor, values: torch.Tensor, last_value: torch.Tensor, dones: torch.Tensor, gamma: float, lam: float
-) -> torch.Tensor:
+    rewards: torch.Tensor, values: torch.Tensor, last_value: torch.Tensor, dones: torch.Tensor,
+    gamma: torch.Tensor | float, lam: float,
+) -> torch.Tensor:  # fmt: skip
     """Generalised advantage estimates (T, ...) of a rollout.
 
     Args:
@@ -53,7 +54,7 @@ def generalized_advantages(
         values: (T, ...) of the states acted in.
         last_value: (...) of the state after the last step.
         dones: (T, ...) bool, broadcastable: the episode ended with that step.
-        gamma: Discount.
+        gamma: Discount, one number or of each of the last dimension.
         lam: Trace decay.
     """
     advantages = torch.empty_like(rewards)
