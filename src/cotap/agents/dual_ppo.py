@@ -34,7 +34,7 @@ class DualPPOConfig:
     """Hidden layers of every actor and critic."""
     initial_std: float = 0.6
     """Standard deviation of actions at the start."""
-    std_half_life: float = 600.0
+    std_half_life: float = 3000.0
     """Iterations in which the largest standard deviation allowed falls by half: wide at first, precise later."""
     least_std: float = 0.2
     """Where that fall ends."""
@@ -60,7 +60,7 @@ class DualPPOConfig:
     """Weight of the value loss."""
     learning_rate: float = 1e-3
     """At the start; then adapted to `desired_kl`, per agent."""
-    desired_kl: float = 0.015
+    desired_kl: float = 0.02
     """Change of the policy per update that the learning rate aims at [nat]."""
     max_grad_norm: float = 1.0
     """Gradient norm above which gradients are scaled down, per network."""

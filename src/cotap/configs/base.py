@@ -58,8 +58,8 @@ def default() -> BaseTraining:
             num_envs=1024,
             assist=AssistConfig(enabled=True),
             forces=ExternalForceConfig(
-                hand_loads=HandLoadConfig(enabled=True, ramp=RampConfig(20e6, 60e6, first=0.1)),
-                pushes=PushConfig(enabled=True, velocity=(0.0, 1.3), ramp=RampConfig(30e6, 80e6)),
+                hand_loads=HandLoadConfig(enabled=True, ramp=RampConfig(16e6, 60e6, first=0.1)),
+                pushes=PushConfig(enabled=True, velocity=(0.0, 1.3), ramp=RampConfig(20e6, 80e6)),
             ),
         ),
         runner=RunnerConfig(iterations=12_207),
@@ -69,8 +69,7 @@ def default() -> BaseTraining:
 def quick() -> BaseTraining:
     """Walking in the shortest time: no pushes, no loads; 30 M samples."""
     return BaseTraining(
-        env=HumanoidEnvConfig(num_envs=1024, assist=AssistConfig(enabled=True, end_samples=16e6)),
-        ppo=DualPPOConfig(std_half_life=400.0),
+        env=HumanoidEnvConfig(num_envs=1024, assist=AssistConfig(enabled=True)),
         runner=RunnerConfig(iterations=1220),
     )
 

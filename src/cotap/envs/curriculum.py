@@ -52,7 +52,7 @@ class AssistConfig:
     """Whether to assist; training switches it on."""
     full_samples: float = 2e6
     """Samples with full assistance."""
-    end_samples: float = 24e6
+    end_samples: float = 16e6
     """Samples after which there is none. On the way its share falls as the square of what is left."""
     upright_stiffness: float = 0.8
     """Righting torque per radian of tilt, over weight times nominal height [1/rad]."""

@@ -162,7 +162,7 @@ def swing_clearance(swing: torch.Tensor, peak_m: float) -> torch.Tensor:
 class LowerRewards:
     """Weights of the lower agent's terms [1/s]; 0 switches a term off."""
 
-    @term(1.5)
+    @term(4.0)
     def track_velocity(s: StepRecord) -> torch.Tensor:
         """Velocity against its command, wide kernel: a direction to follow from far away."""
         return torch.exp(-_velocity_error(s) / 0.25)
@@ -177,12 +177,12 @@ class LowerRewards:
         """Velocity averaged over about half a stride: what sways with every step is no reason to walk too slowly."""
         return torch.exp(-s.mean_error[:, :2].square().sum(1) / 0.015)
 
-    @term(0.6)
+    @term(1.0)
     def track_yaw_rate(s: StepRecord) -> torch.Tensor:
         """Angular velocity about the vertical against its command, wide kernel."""
         return torch.exp(-(s.command.yaw_rate - s.state.yaw_rate).square())
 
-    @term(1.5)
+    @term(2.0)
     def track_yaw_rate_closely(s: StepRecord) -> torch.Tensor:
         """Angular velocity about the vertical against its command, narrow kernel."""
         return torch.exp(-(s.command.yaw_rate - s.state.yaw_rate).square() / 0.06)
@@ -227,7 +227,7 @@ class LowerRewards:
         """Squared angular velocity of the torso about its horizontal axes."""
         return s.state.torso_angular_velocity_t[:, :2].square().sum(1)
 
-    @term(2.0)
+    @term(1.0)
     def contact_schedule(s: StepRecord) -> torch.Tensor:
         """Share of feet that are on the ground, or off it, as the gait's phase asks."""
         return (s.state.foot_contact == s.desired_contact).float().mean(1)
