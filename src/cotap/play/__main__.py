@@ -26,7 +26,7 @@ class PlayOptions:
     """A page on which a robot walks, is pushed, and has its stiffness turned."""
 
     host: str = "127.0.0.1"
-    """Address to listen at. 127.0.0.1 is this machine only; 0.0.0.0 lets everybody in who can reach it."""
+    """Address to listen at: 127.0.0.1 for this machine only, 0.0.0.0 for others, too; the URL then has a token."""
     port: int = 8080
     """Port to listen at."""
     checkpoint: tuple[str, ...] = ()
@@ -62,14 +62,16 @@ def _run(options: PlayOptions) -> int:
         raise ValueError("a checkpoint has its own robot: leave out --robot with --checkpoint")
     try:
         with uncollected():
+            from cotap.play.guard import new_token, page_url
             from cotap.play.server import open_server
     except ImportError as error:
         raise ValueError(f"the page needs viser and mjviser ({error}): pip install 'cotap[play]'") from error
-    server = open_server(options.host, options.port)
+    token = new_token(options.host)
+    server = open_server(options.host, options.port, token)
     try:
         # The page answers while torch, the policy and the model are still being loaded.
         loading = server.gui.add_markdown("Loading the simulation ...")
-        print(f"open http://{'localhost' if options.host in ('127.0.0.1', '0.0.0.0') else options.host}:{options.port}")
+        print(f"open {page_url(options.host, options.port, token)}", flush=True)
         with uncollected():
             app = _replay(options, server) if options.replay else _live(options, server)
         loading.remove()

@@ -8,26 +8,27 @@ import socket
 import viser
 
 from cotap.checks import require_range
+from cotap.play.guard import Guard
+from cotap.play.websocket import guarded_server
 
 
 class PortTaken(OSError):
     """The page cannot be opened where it was asked for; the message says what to do."""
 
 
-def open_server(host: str, port: int) -> viser.ViserServer:
-    """A page at `http://host:port`.
+def open_server(host: str, port: int, token: str = "") -> viser.ViserServer:
+    """A page at `http://host:port`, closed to other websites and, where it has a token, to who does not know that.
 
     Raises:
         PortTaken: another program has the port, or the address is not this machine's.
-        ValueError: the port is out of its range.
+        ValueError: the port is out of its range, or the page can be reached from elsewhere and there is no token.
     """
     require_range("port", port, 1, 65535)
     _require_free(host, port)
-    server = viser.ViserServer(host=host, port=port, label="cotap", verbose=False)
+    server = guarded_server(Guard(host, port, token), host=host, port=port, label="cotap", verbose=False)
     if server.get_port() != port:  # taken in between: viser goes on to the next
         server.stop()
         raise PortTaken(_advice(host, port, "another program has just taken it"))
-    # People's simulations stay theirs: no public tunnel at the push of a button.
     server.gui.configure_theme(show_share_button=False, show_logo=False, control_width="large")
     # A browser that draws without a graphics card takes seconds to prepare an environment map, and as long for every
     # few frames with it or with shadows.
