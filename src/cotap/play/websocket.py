@@ -1,4 +1,4 @@
-"""How viser's web server is opened: guarded."""
+"""How viser's web server is opened: guarded, and deaf to all but a few messages."""
 
 from __future__ import annotations
 
@@ -6,17 +6,44 @@ from collections.abc import Callable
 from http import HTTPStatus
 from typing import Any
 
+import msgspec
 import viser
 import websockets.asyncio.server as websockets_server
+from viser._messages import ShareUrlDisconnect, ShareUrlRequest
 from websockets.asyncio.server import ServerConnection
+from websockets.frames import CloseCode
 from websockets.http11 import Request, Response
 
 from cotap.play.guard import Guard
+from cotap.play.messages import MAX_BYTES, ViewerCameraMessage, parse
 
 MAX_VIEWERS = 32
 """How many look on at once."""
+MAX_QUEUE = 4
+"""How many messages of a viewer wait to be read."""
 
 Answer = Callable[[ServerConnection, Request], Response | None]
+
+
+class Viewer(ServerConnection):
+    """A browser's connection. What a browser may not say never reaches viser."""
+
+    _counted = False
+
+    async def recv(self, decode: bool | None = None) -> bytes:
+        """The next message that may be said."""
+        while True:
+            data = await super().recv(decode)
+            try:
+                message = parse(data if isinstance(data, bytes) else data.encode())
+            except ValueError:
+                await self.close(CloseCode.INVALID_DATA, "no message of the page's")
+                continue  # and find the connection closed
+            # viser counts a browser among its clients, and forgets what it keeps of one, from its first camera on.
+            self._counted |= isinstance(message, ViewerCameraMessage)
+            if message is not None and self._counted:
+                # Written anew: viser reads what was checked, not what else the same bytes may mean to another reader.
+                return msgspec.msgpack.encode(message)
 
 
 def guarded_server(guard: Guard, **options: Any) -> viser.ViserServer:
@@ -37,16 +64,20 @@ def guarded_server(guard: Guard, **options: Any) -> viser.ViserServer:
     if not opened:
         server.stop()
         raise ValueError(f"viser {viser.__version__} cannot be guarded against strangers; install viser 1.1.1")
+    # Browsers are not heard when they ask for a public tunnel, and nothing is left that would open one.
+    for message in (ShareUrlRequest, ShareUrlDisconnect):
+        server._websock_server.unregister_handler(message)
     return server
 
 
 def _guarded_serve(guard: Guard, opened: list[bool]) -> Callable[..., Any]:
     """websockets' `serve` with a guard; `opened` has an entry once it was called."""
     serve = websockets_server.serve
+    limits = {"max_size": MAX_BYTES, "max_queue": MAX_QUEUE, "create_connection": Viewer}
 
     def guarded_serve(*args: Any, process_request: Answer, **options: Any) -> Any:
         opened.append(True)
-        return serve(*args, process_request=_answer(guard, process_request), **options)
+        return serve(*args, process_request=_answer(guard, process_request), **options | limits)
 
     return guarded_serve
 
