@@ -109,3 +109,10 @@ def test_the_recording_is_downloaded_as_it_was_read(replay):
     for callback in button._impl.update_cb:
         callback(GuiEvent(client, 1, button))
     assert sent == [("walk.npz", replay._archive.path.read_bytes())]
+    for callback in button._impl.update_cb * 20:
+        callback(GuiEvent(client, 1, button))
+    assert len(sent) == 1
+    assert replay.notices == ["once in 10 s"] * 20
+    for callback in button._impl.update_cb:
+        callback(GuiEvent(client, 2, button))
+    assert len(sent) == 2

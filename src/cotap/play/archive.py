@@ -11,8 +11,11 @@ import viser
 
 from cotap.evaluation.recording import Recording
 from cotap.play.film import film
-from cotap.play.notices import Notices
+from cotap.play.notices import Notices, RateLimit
 from cotap.play.scene import Scene
+
+DOWNLOAD_S = 10.0
+"""A viewer gets the recording this often at most [s]: what a browser does not take waits in memory."""
 
 
 class Archive:
@@ -32,6 +35,7 @@ class Archive:
         self.drawing = threading.Lock()
         """Held by whoever draws: a page's loop for one picture, a film until it is done."""
         self._one_film = threading.Lock()
+        self._downloads = RateLimit(DOWNLOAD_S)
 
     def keep(self, recording: Recording) -> Path:
         """Write a recording under the next free number. Raises OSError if it cannot be written."""
@@ -73,10 +77,12 @@ class Archive:
                 self.film(event.client, scene)
 
         def on_download(event: viser.GuiEvent[Any]) -> None:
-            if event.client is None:
+            if event.client is None or event.client_id is None:
                 return
             if self.path is None:
                 self._notices.tell("record something first", event.client, "nothing to download")
+            elif not self._downloads.grants(event.client_id):
+                self._notices.tell(f"once in {DOWNLOAD_S:g} s", event.client, "it is on its way")
             else:
                 event.client.send_file_download(self.path.name, self.path.read_bytes())
 
