@@ -116,3 +116,11 @@ def test_the_recording_is_downloaded_as_it_was_read(replay):
     for callback in button._impl.update_cb:
         callback(GuiEvent(client, 2, button))
     assert len(sent) == 2
+
+
+def test_the_name_of_the_file_is_text_not_html(server, record, tmp_path):
+    Replay(server, record(5, 1), tmp_path / "<img src=x onerror=alert(1)>.npz")
+    messages = server._websock_server._broadcast_buffer.message_from_id.values()
+    shown = [m.props._markdown for m in messages if type(m).__name__ == "GuiMarkdownMessage"]
+    assert any("&lt;img" in text for text in shown)
+    assert not any("<img" in text for text in shown)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import threading
 import time
 from pathlib import Path
@@ -50,7 +51,8 @@ class Replay:
         self._archive = Archive(path.parent, self._notices)
         self._archive.newest, self._archive.path = recording, path
         gui = server.gui
-        gui.add_markdown(f"**{path.name}**, {len(self._samples) * self._dt:.1f} s")
+        # A file's name comes with the file, and viser's browsers run what HTML they find in text.
+        gui.add_markdown(f"**{html.escape(path.name)}**, {len(self._samples) * self._dt:.1f} s")
         self._playing = gui.add_checkbox("play", True)
         self._speed, self._at = SPEED.default, 0.0
         end = max(self._dt, round(self._dt * (len(self._samples) - 1), 6))
