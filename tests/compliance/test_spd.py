@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import permutations
 
 import numpy as np
 import pytest
@@ -96,13 +97,126 @@ def test_gradients_against_finite_differences(rng, equal):
     )
 
 
+def test_derivatives_of_any_order_by_hand():
+    """Of the logarithm of one number: 1/k, -1/k^2, 2/k^3, -6/k^4."""
+    k = torch.tensor([[4.0]], requires_grad=True)
+    derivative = spd_log(k).sum()
+    for expected in (1 / 4, -1 / 16, 2 / 64, -6 / 256):
+        (gradient,) = torch.autograd.grad(derivative.sum(), k, create_graph=True)
+        assert float(gradient.detach()) == pytest.approx(expected, rel=1e-6)
+        derivative = gradient
+    one = torch.ones(1, 1)
+    assert float(torch.autograd.functional.jvp(spd_log, k.detach(), one)[1]) == pytest.approx(0.25)
+    assert float(torch.func.jvp(spd_log, (k.detach(),), (one,))[1]) == pytest.approx(0.25)
+    (slope,) = torch.autograd.grad(spd_log(k).sum(), k, create_graph=True)
+    (gradient,) = torch.autograd.grad((k + slope.square()).sum(), k)
+    assert float(gradient) == pytest.approx(1.0 - 2.0 / 64.0)
+
+
+def few_eigenvalues(rng, *values: float) -> torch.Tensor:
+    """(3, 3) with these three eigenvalues."""
+    q, _ = torch.linalg.qr(torch.randn(3, 3, dtype=DOUBLE, generator=rng))
+    return q @ torch.diag(torch.tensor(values, dtype=DOUBLE)) @ q.T
+
+
+EIGENVALUES = [(0.5, 2.0, 7.0), (2.0, 2.0, 2.0), (2.0, 2.0, 5.0), (2.0, 2.0 * (1.0 + 1e-9), 5.0), (2.0, 2.0003, 5.0)]
+
+
+@pytest.mark.parametrize("values", EIGENVALUES)
+def test_second_derivatives_at_distinct_close_and_equal_eigenvalues(rng, values):
+    """The trace of the logarithm is the logarithm of the determinant, whose derivatives have a closed form."""
+    k = few_eigenvalues(rng, *values)
+    inverse = torch.linalg.inv(k)
+    closed = -0.5 * (torch.einsum("ik,jl->ijkl", inverse, inverse) + torch.einsum("il,jk->ijkl", inverse, inverse))
+
+    def log_det(m: torch.Tensor) -> torch.Tensor:
+        return spd_log(m).trace()
+
+    for hessian in (torch.autograd.functional.hessian(log_det, k), torch.func.hessian(log_det)(k)):
+        torch.testing.assert_close(hessian, closed, rtol=1e-9, atol=1e-10)
+    k = k.requires_grad_()
+    other = few_eigenvalues(rng, 1.0, 1.0, 3.0)
+    half = torch.tensor([0.5, 0.5], dtype=DOUBLE)
+    assert torch.autograd.gradgradcheck(lambda m: spd_log(_symmetric(m)), k)
+    assert torch.autograd.gradgradcheck(lambda m: modulate_stiffness(_symmetric(m), other, 0.3), k)
+    assert torch.autograd.gradgradcheck(lambda m: log_euclidean_mean(torch.stack((_symmetric(m), other)), half), k)
+
+
+def _symmetric(m: torch.Tensor) -> torch.Tensor:
+    return 0.5 * (m + m.transpose(-1, -2))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, DOUBLE])
+def test_a_singular_matrix_is_refused_in_any_order_of_rows_and_at_any_scale(rng, dtype):
+    """Singular but for the rounding of its entries; and what has a condition number of 100,000 is not singular."""
+    for rank in (1, 2):
+        for factor in torch.randn(20, 3, rank, dtype=DOUBLE, generator=rng):
+            for scale in (1e-6, 1e-2, 0.3, 1.0, 7.0, 1e3, 1e6):
+                matrix = (scale * factor @ factor.T).to(dtype)
+                for order in permutations(range(3)):
+                    with pytest.raises(ValueError, match="matrix must be positive definite, got an eigenvalue of"):
+                        spd_log(matrix[list(order)][:, list(order)])
+    regular = few_eigenvalues(rng, 1e-5, 1e-2, 1.0).to(dtype)
+    for order in permutations(range(3)):
+        assert spd_log(regular[list(order)][:, list(order)]).isfinite().all()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, DOUBLE])
+def test_an_exponential_is_positive_definite_or_refused(rng, dtype):
+    apart = -math.log(16.0 * torch.finfo(dtype).eps)  # 4 n eps, the rule for what is singular
+    q, _ = torch.linalg.qr(torch.randn(500, 4, 4, dtype=DOUBLE, generator=rng))
+    for spread, allowed in ((0.99 * apart, True), (1.01 * apart, False)):
+        values = torch.tensor([0.0, 0.2, 0.9, 1.0], dtype=DOUBLE) * spread - 5.0
+        matrices = _symmetric((q * values) @ q.transpose(-1, -2)).to(dtype)
+        if allowed:
+            assert float(torch.linalg.eigvalsh(spd_exp(matrices).double()).min()) > 0.0
+            assert spd_log(spd_exp(matrices)).isfinite().all()
+        else:
+            with pytest.raises(ValueError, match=rf"less than {apart:.1f} apart, .* positive definite in {dtype}"):
+                spd_exp(matrices)
+    for much in (1000.0, -1000.0):
+        with pytest.raises(ValueError, match="matrix must have eigenvalues from"):
+            spd_exp(much * torch.eye(2, dtype=dtype))
+
+
+def blend_of_three(k: torch.Tensor) -> torch.Tensor:
+    """(3, n, n) through all functions of the module."""
+    blend = modulate_stiffness(k, k.flip(0), torch.tensor([0.1, 0.5, 0.9]))
+    mean = log_euclidean_mean(torch.stack((blend, k), 1), torch.full((3, 2), 0.5))
+    return spd_exp(spd_log(mean))
+
+
+def test_autocast_changes_nothing(rng):
+    k = random_spd(rng, 3).float()
+    with torch.autocast("cpu", torch.bfloat16):
+        inside = blend_of_three(k)
+    assert torch.equal(inside, blend_of_three(k))
+
+
+def test_compiled_and_mapped_functions_are_the_plain_ones(rng):
+    k = random_spd(rng, 3, spread=1.0).float().requires_grad_()
+    compiled = torch.compile(blend_of_three, fullgraph=True, backend="aot_eager")(k)
+    torch.testing.assert_close(compiled, blend_of_three(k))
+    plain, traced = (torch.autograd.grad(out.sum(), k)[0] for out in (blend_of_three(k), compiled))
+    torch.testing.assert_close(traced, plain)
+    k, alpha = k.detach(), torch.tensor([0.1, 0.5, 0.9])
+    mapped = torch.vmap(lambda m, a: modulate_stiffness(m, k[0], a))(k, alpha)
+    torch.testing.assert_close(mapped, modulate_stiffness(k, k[:1].expand(3, 4, 4), alpha))
+    each = torch.vmap(torch.func.grad(lambda m: spd_log(m).trace()))(k)
+    torch.testing.assert_close(each, torch.linalg.inv(k), rtol=1e-4, atol=1e-6)
+    # Nobody looks at values in there.
+    assert torch.vmap(spd_log)(-torch.eye(2).expand(3, 2, 2)).isnan().any()
+
+
 @pytest.mark.parametrize("function", [spd_log, spd_exp])
 @pytest.mark.parametrize(
     ("matrix", "message"),
     [
         (torch.ones(3), r"matrix must have shape \(\.\.\., n, n\), got \(3,\)"),
         (torch.ones(2, 3), r"got \(2, 3\)"),
-        (torch.eye(2, dtype=torch.int64), "must hold floating point numbers"),
+        (torch.eye(2, dtype=torch.int64), "must hold float32 or float64 numbers, got torch.int64"),
+        (torch.eye(2, dtype=torch.bfloat16), "must hold float32 or float64 numbers, got torch.bfloat16"),
+        ([[1.0]], "matrix must be a tensor, got list"),
         (torch.tensor([[1.0, math.nan], [math.nan, 1.0]]), "must be finite"),
         (torch.tensor([[2.0, 1.0], [0.5, 2.0]]), "must be symmetric, got entries that differ by 0.5"),
         (torch.ones(0, 0), "must not be empty"),
@@ -120,11 +234,54 @@ def test_other_bad_input_is_named(rng):
     for alpha in (-0.1, 1.1, math.nan):
         with pytest.raises(ValueError, match=r"alpha must"):
             modulate_stiffness(k, k, alpha)
-    with pytest.raises(ValueError, match=r"weights must sum to 1, got 0\.9"):
-        log_euclidean_mean(k, torch.tensor([0.5, 0.4]))
-    with pytest.raises(ValueError, match=r"weights must not be negative, got -0\.5"):
-        log_euclidean_mean(k, torch.tensor([1.5, -0.5]))
-    with pytest.raises(ValueError, match=r"weights must have shape \(\.\.\., 2\)"):
-        log_euclidean_mean(k, torch.ones(3) / 3)
+    for name, pair in (("k_comp", (-k, k)), ("k_pd", (k, -k))):
+        with pytest.raises(ValueError, match=f"{name} must be positive definite"):
+            modulate_stiffness(*pair, 0.5)
+
+
+K = torch.eye(4).expand(5, 4, 4)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((K.long(), K, 0.5), "k_comp must hold float32 or float64 numbers, got torch.int64"),
+        ((K, K.long(), 0.5), "k_pd must have the dtype .* of k_comp, torch.float32 on cpu, got torch.int64"),
+        ((K, K.double(), 0.5), "k_pd must have the dtype .* of k_comp, torch.float32 on cpu, got torch.float64"),
+        (
+            (K, K.to("meta"), 0.5),
+            "k_pd must have .* the device of k_comp, torch.float32 on cpu, got torch.float32 on meta",
+        ),
+        ((K, K[:4], 0.5), r"k_pd must have the shape of k_comp, \(5, 4, 4\), got \(4, 4, 4\)"),
+        ((K, K[0], 0.5), r"k_pd must have the shape of k_comp, \(5, 4, 4\), got \(4, 4\)"),
+        ((K, K, torch.ones(5, 1)), r"alpha must be one number or, as k_comp, have shape \(5,\), got \(5, 1\)"),
+        ((K, K, torch.ones(4)), r"alpha must .* have shape \(5,\), got \(4,\)"),
+        (
+            (K, K, torch.ones(5, dtype=torch.int64)),
+            "alpha must have the dtype .* of k_comp, torch.float32 on cpu, got torch.int64",
+        ),
+        ((K, K, "much"), "alpha must be a finite number, got 'much'"),
+    ],
+)
+def test_types_and_shapes_that_do_not_fit_are_named(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        modulate_stiffness(*arguments)
+
+
+@pytest.mark.parametrize(
+    ("weights", "message"),
+    [
+        (torch.tensor([0.5, 0.4]), r"weights must sum to 1, got 0\.9"),
+        (torch.tensor([1.5, -0.5]), r"weights must not be negative, got -0\.5"),
+        (torch.ones(3) / 3, r"weights must have shape \(2,\), got \(3,\)"),
+        (
+            torch.ones(2, dtype=DOUBLE) / 2,
+            "weights must have the dtype .* of stiffness, torch.float32 .* got torch.float64",
+        ),
+    ],
+)
+def test_bad_weights_are_named(weights, message):
+    with pytest.raises(ValueError, match=message):
+        log_euclidean_mean(K[:2], weights)
     with pytest.raises(ValueError, match=r"stiffness must have shape \(\.\.\., k, n, n\)"):
-        log_euclidean_mean(k[0], torch.ones(1))
+        log_euclidean_mean(K[0], torch.ones(1))
