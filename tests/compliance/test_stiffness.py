@@ -241,6 +241,15 @@ def test_arm_kinematics_agrees_with_the_chains_of_rollouts(spec, rng):
     assert ArmKinematics(spec).jacobian(q).dtype == torch.float32
     one = q[:1].double().requires_grad_()
     assert torch.autograd.gradcheck(kinematics.hand_position, one)
+    for function in (kinematics.hand_position, kinematics.jacobian):
+        assert torch.autograd.gradgradcheck(function, one)
+        compiled = torch.compile(function, fullgraph=True, backend="eager")
+        torch.testing.assert_close(compiled(one.detach()), function(one.detach()))
+    for dtype in (torch.int32, torch.bfloat16):
+        with pytest.raises(ValueError, match=f"dtype must be torch.float32 or torch.float64, got {dtype}"):
+            ArmKinematics(spec, dtype)
+    with pytest.raises(ValueError, match=r"q must hold float32 or float64 numbers, got torch\.int64"):
+        kinematics.jacobian(torch.zeros(3, 8, dtype=torch.int64))
     with pytest.raises(ValueError, match=r"q must have shape \(N, 2, 4\) or \(N, 8\), got \(3, 7\)"):
         kinematics.jacobian(torch.zeros(3, 7))
     with pytest.raises(ValueError, match="q must be finite"):

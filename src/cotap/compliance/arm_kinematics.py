@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from cotap.checks import require_all_finite
+from cotap.compliance.arguments import full_precision, require_floats
 
 if TYPE_CHECKING:
     from cotap.robots import ArmSpec, RobotSpec
@@ -15,15 +15,22 @@ if TYPE_CHECKING:
 class ArmKinematics:
     """Hand positions and Jacobians of a robot's arms, in the frame of the torso link that carries them.
 
+    Both are differentiable to any order. They take batches, and so need no `torch.vmap`, which they do not support.
+
     Args:
         spec: The robot; by default the Unitree H1. Its arms must have equally many joints.
-        dtype: Of all results.
+        dtype: Of all results, torch.float32 or torch.float64.
         device: Where they are computed.
+
+    Raises:
+        ValueError: another dtype.
     """
 
     def __init__(
         self, spec: RobotSpec | None = None, dtype: torch.dtype = torch.float32, device: str | torch.device = "cpu"
     ) -> None:
+        if dtype not in (torch.float32, torch.float64):
+            raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
         if spec is None:
             from cotap.robots import h1
 
@@ -33,31 +40,39 @@ class ArmKinematics:
         self.num_joints = len(spec.arms[0].joints)
 
     def hand_position(self, q: torch.Tensor) -> torch.Tensor:
-        """Hands (N, A, 3) [m] for arm joints `q`, (N, A, n) or (N, A n) [rad]. Differentiable.
+        """Hands (N, A, 3) [m] for arm joints `q`, (N, A, n) or (N, A n) [rad].
 
         Raises:
-            ValueError: `q` has another shape or is not finite.
+            ValueError: `q` has another shape or is not of finite float32 or float64 numbers.
         """
-        arms = self._split(q)
-        matrices = [c.forward_kinematics(arms[:, i]).get_matrix() for i, c in enumerate(self._chains)]
-        return torch.stack([m[:, :3, 3] for m in matrices], 1)
+        return torch.stack([pose[:, :3, 3] for _, pose in self._along(q)], 1)
 
     def jacobian(self, q: torch.Tensor) -> torch.Tensor:
         """Jacobians (N, A, 3, n) [m/rad] of the hand positions, for arm joints `q`, (N, A, n) or (N, A n) [rad].
 
         Raises:
-            ValueError: `q` has another shape or is not finite.
+            ValueError: `q` has another shape or is not of finite float32 or float64 numbers.
         """
-        arms = self._split(q)
-        return torch.stack([c.jacobian(arms[:, i])[:, :3] for i, c in enumerate(self._chains)], 1)
+        return torch.stack([jacobian[:, :3] for jacobian, _ in self._along(q)], 1)
+
+    @full_precision
+    def _along(self, q: torch.Tensor) -> list[tuple[torch.Tensor, torch.Tensor]]:
+        """Of each arm the Jacobian (N, 6, n) and the pose (N, 4, 4) of its hand."""
+        out = []
+        for chain, angles in zip(self._chains, self._split(q).unbind(1), strict=True):
+            # The library's analytical gradient has no derivatives: those beyond the first come out wrong.
+            poses = chain.forward_kinematics_tensor(angles, analytical_grad=False)
+            out.append(chain.jacobian_tensor(angles, ret_eef_pose=True, all_transforms=poses))
+        return out
 
     def _split(self, q: torch.Tensor) -> torch.Tensor:
+        require_floats("q", q)
         arms, joints = len(self._chains), self.num_joints
         if q.dim() == 2 and q.shape[1] == arms * joints:
             q = q.unflatten(1, (arms, joints))
         if q.dim() != 3 or tuple(q.shape[1:]) != (arms, joints):
             raise ValueError(f"q must have shape (N, {arms}, {joints}) or (N, {arms * joints}), got {tuple(q.shape)}")
-        return require_all_finite("q", q).to(dtype=self.dtype, device=self.device)
+        return q.to(dtype=self.dtype, device=self.device)
 
 
 def _serial_chain(spec: RobotSpec, arm: ArmSpec) -> Any:
