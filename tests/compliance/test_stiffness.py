@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import subprocess
 import sys
+from itertools import permutations
 
 import pytest
 import torch
@@ -17,7 +18,7 @@ from cotap.compliance import (
     singularity_aware_ratio,
 )
 from cotap.compliance.fast import blended_stiffness, eigenvalues_3x3, inverse_3x3
-from cotap.compliance.stiffness import project_compliance
+from cotap.compliance.stiffness import RANK_TOLERANCE, project_compliance
 from cotap.robots.chains import arm_chains
 
 DOUBLE = torch.float64
@@ -175,6 +176,146 @@ def test_gradients_against_finite_differences(rng):
     null = torch.tensor(1.5, dtype=DOUBLE, requires_grad=True)
     assert torch.autograd.gradcheck(resolve_joint_stiffness, (j, k, null))
     assert torch.autograd.gradcheck(lambda x: singularity_aware_ratio(0.7, x, threshold=1.5), j)
+    assert torch.autograd.gradgradcheck(resolve_joint_stiffness, (j, k, null))
+
+
+def test_the_derivative_of_the_damped_projector_by_hand():
+    """With J = diag(a, b), b < 0.02 a, the second joint has k11 = 300 b^2 + 40 (1 - b^2 / (0.02 a)^2)."""
+    j = torch.tensor([[1.0, 0.0], [0.0, 0.01]], dtype=DOUBLE, requires_grad=True)
+    k11 = resolve_joint_stiffness(j, torch.full((2,), 300.0, dtype=DOUBLE), 40.0)[1, 1]
+    assert float(k11.detach()) == pytest.approx(300.0 * 1e-4 + 40.0 * 0.75)
+    (gradient,) = torch.autograd.grad(k11, j)
+    expected = torch.tensor([[20.0, 0.0], [0.0, 600.0 * 0.01 - 80.0 * 0.01 / 0.02**2]], dtype=DOUBLE)
+    torch.testing.assert_close(gradient, expected)
+
+
+def test_gradients_at_straight_and_nearly_straight_arms(spec, rng):
+    chains = arm_chains(spec, DOUBLE)
+    q = 0.1 * torch.randn(1, 2, 4, dtype=DOUBLE, generator=rng)
+    q[..., 3] = math.atan2(0.1343 + 0.198, 0.0185) + torch.tensor([0.0, 0.005], dtype=DOUBLE)
+    j = chains.jacobian(chains.pose(q))
+    assert float(condition_number(j).min()) > 1.0 / RANK_TOLERANCE
+    task = torch.tensor([300.0, 200.0, 100.0], dtype=DOUBLE).expand(1, 2, 3)
+
+    def stiffness(angles: torch.Tensor) -> torch.Tensor:
+        return resolve_joint_stiffness(chains.jacobian(chains.pose(angles)), task, 40.0)
+
+    assert torch.autograd.gradcheck(stiffness, q.requires_grad_(), eps=1e-6, atol=1e-3, rtol=1e-5)
+    assert torch.autograd.gradcheck(lambda m: resolve_joint_stiffness(m, task, 40.0), j.detach().requires_grad_())
+
+
+def test_equal_singular_values_have_second_derivatives_where_they_do_not_matter():
+    j = 0.5 * torch.eye(3, 4, dtype=DOUBLE).requires_grad_()
+    k = torch.tensor([300.0, 200.0, 100.0], dtype=DOUBLE)
+    assert torch.autograd.gradgradcheck(lambda m: 1e-3 * resolve_joint_stiffness(m, k, 25.0), j)
+    assert not torch.autograd.functional.hessian(lambda m: singularity_aware_ratio(0.7, m), j).any()
+
+
+def six_rows(rng) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """A pose's Jacobian, of condition number 8 for a length of 0.5 m; the same in mm; task stiffness in SI units."""
+    u, _ = torch.linalg.qr(torch.randn(6, 6, dtype=DOUBLE, generator=rng))
+    v, _ = torch.linalg.qr(torch.randn(7, 7, dtype=DOUBLE, generator=rng))
+    j = (u * torch.tensor([1.6, 1.2, 0.9, 0.6, 0.3, 0.2], dtype=DOUBLE)) @ v[:, :6].T
+    j[3:] /= 0.5
+    in_mm = torch.cat((1000.0 * j[:3], j[3:]))
+    return j, in_mm, torch.tensor([500.0, 400.0, 300.0, 20.0, 30.0, 10.0], dtype=DOUBLE)
+
+
+def test_six_rows_do_not_depend_on_the_unit_of_length(rng):
+    j, in_mm, task = six_rows(rng)
+    assert float(condition_number(j, 0.5)) == pytest.approx(8.0)
+    assert float(condition_number(in_mm, 500.0)) == pytest.approx(8.0)
+    assert float(condition_number(in_mm)) > 100.0
+    ratios = [singularity_aware_ratio(0.7, a, 4.0, b) for a, b in ((j, 0.5), (in_mm, 500.0))]
+    assert [float(r) for r in ratios] == pytest.approx([0.7 / 5.0] * 2)
+    for weaker in (1.0, 0.01):  # the second one is damped
+        j, in_mm = (torch.cat((weaker * m[:1], m[1:])) for m in (j, in_mm))
+        k = resolve_joint_stiffness(j, task, 25.0, characteristic_length=0.5)
+        scale = torch.tensor(3 * [1e-3] + 3 * [1e3], dtype=DOUBLE)  # N/mm and N mm/rad
+        k_mm = resolve_joint_stiffness(in_mm, scale * task, 25e3, characteristic_length=500.0)
+        torch.testing.assert_close(k_mm / 1e3, k, rtol=1e-9, atol=1e-9)
+        base = torch.diag(1e-4 / task)
+        torch.testing.assert_close(
+            resolve_joint_stiffness(in_mm, scale * task, 25e3, base / scale, 500.0) / 1e3,
+            resolve_joint_stiffness(j, task, 25.0, base, 0.5), rtol=1e-9, atol=1e-9,
+        )  # fmt: skip
+        if weaker == 1.0:
+            felt = j @ torch.linalg.inv(k) @ j.T
+            torch.testing.assert_close(felt, torch.diag(1.0 / task), rtol=1e-9, atol=1e-12)
+
+
+def test_the_length_matters_for_six_rows_alone_and_is_one_by_default(rng):
+    j, _, task = six_rows(rng)
+    torch.testing.assert_close(condition_number(j), condition_number(j, 1.0))
+    torch.testing.assert_close(
+        resolve_joint_stiffness(j, task, 25.0), resolve_joint_stiffness(j, task, 25.0, None, 1.0)
+    )
+    assert torch.equal(condition_number(j[:3], 0.1), condition_number(j[:3]))
+    for length in (0.0, -1.0, math.nan):
+        for function in (
+            lambda length: condition_number(j, length),
+            lambda length: singularity_aware_ratio(0.5, j, characteristic_length=length),
+            lambda length: resolve_joint_stiffness(j, task, 25.0, characteristic_length=length),
+        ):
+            with pytest.raises(ValueError, match="characteristic_length must be"):
+                function(length)
+
+
+def test_rank_is_lost_in_any_order_of_rows(rng):
+    for factor in torch.randn(20, 3, 2, dtype=DOUBLE, generator=rng):
+        j = (factor @ torch.randn(2, 4, dtype=DOUBLE, generator=rng)).float()
+        for order in permutations(range(3)):
+            assert math.isinf(float(condition_number(j[list(order)])))
+
+
+def law_of_an_arm(jacobian: torch.Tensor, task: torch.Tensor, alpha: float) -> torch.Tensor:
+    """Through all functions of the library."""
+    k = resolve_joint_stiffness(jacobian, task, 25.0, 1e-4 * torch.ones_like(task))
+    pd = (100.0 * torch.eye(k.shape[-1])).expand_as(k)
+    return modulate_stiffness(k, pd, singularity_aware_ratio(alpha, jacobian))
+
+
+def test_autocast_changes_nothing(rng):
+    j, task = random_jacobians(rng, 5).float(), torch.full((5, 3), 300.0)
+    kinematics, q = ArmKinematics(), torch.randn(5, 8, generator=rng)
+    with torch.autocast("cpu", torch.bfloat16):
+        inside = law_of_an_arm(j, task, 0.7), kinematics.jacobian(q), kinematics.hand_position(q)
+    outside = law_of_an_arm(j, task, 0.7), kinematics.jacobian(q), kinematics.hand_position(q)
+    assert all(torch.equal(a, b) for a, b in zip(inside, outside, strict=True))
+
+
+def test_compiled_and_mapped_functions_are_the_plain_ones(rng):
+    j, task = random_jacobians(rng, 5).float().requires_grad_(), torch.full((5, 3), 300.0)
+    compiled = torch.compile(law_of_an_arm, fullgraph=True, backend="eager")
+    for alpha in (0.7, 0.3):
+        expected = law_of_an_arm(j, task, alpha)
+        torch.testing.assert_close(compiled(j, task, alpha), expected)
+    plain, traced = (torch.autograd.grad(f(j, task, 0.7).sum(), j)[0] for f in (law_of_an_arm, compiled))
+    torch.testing.assert_close(traced, plain)
+    mapped = torch.vmap(law_of_an_arm, in_dims=(0, 0, None))
+    torch.testing.assert_close(mapped(j, task, 0.7), law_of_an_arm(j, task, 0.7))
+    pose, stiffness = torch.cat((j, j), 1)[:1].detach(), torch.full((1, 6), 300.0)
+    wide = torch.cat((pose, torch.eye(6).expand(1, 6, 6)), -1)
+    six = torch.compile(resolve_joint_stiffness, fullgraph=True, backend="eager")
+    for length in (0.5, 0.3):
+        torch.testing.assert_close(
+            six(wide, stiffness, 25.0, None, length), resolve_joint_stiffness(wide, stiffness, 25.0, None, length)
+        )
+
+
+def test_hessians_forward_over_reverse_are_those_of_finite_differences(rng):
+    j, task = random_jacobians(rng, 1, largest_condition=5.0)[0], torch.tensor([3.0, 4.0, 5.0], dtype=DOUBLE)
+
+    def total(m: torch.Tensor) -> torch.Tensor:
+        k = resolve_joint_stiffness(m, task, 2.0)
+        pd = torch.eye(4, dtype=DOUBLE)
+        return modulate_stiffness(k, pd, singularity_aware_ratio(0.7, m, threshold=1.5)).square().sum()
+
+    hessian = torch.func.hessian(total)(j)
+    step = 1e-5 * torch.eye(12, dtype=DOUBLE).unflatten(1, (3, 4))
+    gradient = torch.func.grad(total)
+    differences = torch.stack([(gradient(j + h) - gradient(j - h)) / 2e-5 for h in step]).reshape(3, 4, 3, 4)
+    torch.testing.assert_close(hessian, differences, rtol=1e-6, atol=1e-6)
 
 
 def test_projection_raises_eigenvalues_to_the_floor_and_says_where():
@@ -195,6 +336,7 @@ def test_matrices_and_diagonals_are_told_apart_by_their_dimensions(rng):
 
 J = torch.eye(3, 4)
 K = torch.full((3,), 300.0)
+J5, K5 = J.expand(5, 3, 4), K.expand(5, 3)
 
 
 @pytest.mark.parametrize(
@@ -203,19 +345,42 @@ K = torch.full((3,), 300.0)
         ((torch.ones(4), K, 25.0), r"jacobian must have shape \(\.\.\., m, n\), got \(4,\)"),
         ((torch.ones(4, 3), K, 25.0), "a task of 4 dimensions needs at least 4 joints, the jacobian has 3"),
         ((torch.full((3, 4), math.nan), K, 25.0), "jacobian must be finite"),
-        ((torch.ones(3, 4, dtype=torch.int64), K, 25.0), "floating point"),
+        (
+            (torch.ones(3, 4, dtype=torch.int64), K, 25.0),
+            "jacobian must hold float32 or float64 numbers, got torch.int64",
+        ),
         (
             (J, torch.tensor([300.0, -1.0, 300.0]), 25.0),
             "task_stiffness must be positive definite, got an eigenvalue of -1",
         ),
         ((J, torch.tensor([300.0, 0.0, 300.0]), 25.0), "task_stiffness must be positive definite"),
         ((J, torch.tensor([300.0, math.inf, 300.0]), 25.0), "task_stiffness must be finite"),
-        ((J, torch.ones(2), 25.0), r"task_stiffness must have 1 dimensions"),
+        ((J, torch.ones(2), 25.0), r"task_stiffness must have shape \(3,\), a diagonal, or \(3, 3\), got \(2,\)"),
+        ((J5, K5[:4], 25.0), r"task_stiffness must have shape \(5, 3\), a diagonal, or \(5, 3, 3\), got \(4, 3\)"),
+        ((J5, K, 25.0), r"task_stiffness must have shape \(5, 3\), .* got \(3,\)"),
+        (
+            (J, K.double(), 25.0),
+            "task_stiffness must have the dtype .* of jacobian, torch.float32 on cpu, got torch.flo",
+        ),
+        (
+            (J, K.long(), 25.0),
+            "task_stiffness must have the dtype .* of jacobian, torch.float32 on cpu, got torch.int64",
+        ),
+        ((J5, K5, torch.ones(4)), r"null_stiffness must .* have shape \(5,\), got \(4,\)"),
+        ((J5, K5, torch.ones(5, 1)), r"null_stiffness must .* have shape \(5,\), got \(5, 1\)"),
+        ((J5, K5, 25.0, K5[:4]), r"base_compliance must have shape \(5, 3\), .* got \(4, 3\)"),
+        ((J.numpy(), K, 25.0), "jacobian must be a tensor, got ndarray"),
         ((J, torch.triu(torch.ones(3, 3)), 25.0), "task_stiffness must be symmetric"),
         ((J, K, 0.0), "null_stiffness must be positive, got 0"),
-        ((J, K, math.nan), "null_stiffness must be finite"),
+        ((J, K, math.nan), "null_stiffness must be a finite number, got nan"),
         ((J, K, 25.0, torch.tensor([1e-3, 1e-2, 1e-3])), "task_stiffness is more than the base allows"),
         ((J, K, 25.0, torch.tensor([1e-3, -1e-2, 1e-3])), "base_compliance must not be negative"),
+        ((J, K, 25.0, 1.0 / K), "task_stiffness is more than the base allows"),
+        (
+            (J5[:2], K5[:2], 25.0, torch.tensor([[1e-3, 1e-3, 1e-3], [1e-9, -1e-10, 1e-9]])),
+            "base_compliance must not be negative, got an eigenvalue of -1e-10",
+        ),
+        ((J, torch.tensor([300.0, 1e-5, 300.0]), 25.0), "task_stiffness must be positive definite"),
     ],
 )
 def test_bad_input_is_named(arguments, message):
