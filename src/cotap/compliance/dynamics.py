@@ -7,6 +7,7 @@ from itertools import combinations
 
 import torch
 
+from cotap.compliance.arguments import full_precision
 from cotap.compliance.kinematics import ChainPose
 from cotap.rotations import rotate
 
@@ -102,6 +103,7 @@ def _cross(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     return torch.stack((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx), 2)
 
 
+@full_precision
 def critical_damping(stiffness: torch.Tensor, inertia: torch.Tensor, ratio: float = 1.0) -> torch.Tensor:
     """Joint damping (..., n, n) [Nms/rad] that damps every mode of `M q'' + D q' + K q = 0` by `ratio` of critical.
 

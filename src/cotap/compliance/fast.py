@@ -6,7 +6,8 @@ For a PD law whose gain is one number k on all joints of an arm, the log-Euclide
     K = k^(1-a) (B^T G^(a-1) B + k_null^a N),
 
 and the power of the m x m matrix G is a Newton polynomial through its eigenvalues, which have a closed form for m = 3.
-All in float64: the polynomial's terms cancel, and one double costs less than one eigendecomposition.
+All in float64: the polynomial's terms cancel, and one double costs less than one eigendecomposition. Not to be
+differentiated: where eigenvalues coincide, the result is not finite.
 """
 
 from __future__ import annotations

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import torch
 
+from cotap.compliance.arguments import full_precision
+
 FORCE_DAMPING_M2 = 1e-3
 """Damping of the inverse from joint torque to hand force [m^2]: a share of 0.1 where a radian moves the hand 0.1 m."""
 
@@ -27,6 +29,7 @@ def observe_torque(
     return torch.lerp(residual, momentum_change / dt - effort + gravity, share)
 
 
+@full_precision
 def hand_force(jacobian: torch.Tensor, torque: torch.Tensor) -> torch.Tensor:
     """Force (..., 3) at the hand that explains joint torques (..., n) best, `tau = J^T f` [N].
 

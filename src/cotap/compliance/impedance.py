@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import torch
 
+from cotap.compliance.arguments import full_precision
 from cotap.compliance.dynamics import gravity_torque
 from cotap.compliance.interface import Arms, ArmState, LawParameters, LawReport, TorqueLaw
 
@@ -27,6 +28,7 @@ class BlendedTorqueLaw:
         self._arms, self._mass, self._damping_ratio = arms, mass, damping_ratio
         self._kp, self._kd = torch.diag_embed(arms.kp), torch.diag_embed(arms.kd)
 
+    @full_precision
     def __call__(self, state: ArmState, parameters: LawParameters) -> tuple[TorqueLaw, LawReport]:
         """Both controllers' torques, weighted."""
         chains, rotation = self._arms.chains, state.to_heading.unsqueeze(1)

@@ -9,6 +9,7 @@ import torch
 
 from cotap.checks import require_one_of, require_range
 from cotap.compliance.admittance import AdmittanceLaw, StaticShift, VirtualMass
+from cotap.compliance.arguments import full_precision
 from cotap.compliance.dynamics import critical_damping, gravity_torque, joint_inertia
 from cotap.compliance.fast import ArmStiffness, blended_stiffness, inverse_3x3
 from cotap.compliance.impedance import BlendedTorqueLaw
@@ -110,6 +111,7 @@ class CoTaPLaw:
         self._arms, self._cfg = arms, cfg
         self._damping = torch.diag_embed(arms.kd)
 
+    @full_precision
     def __call__(self, state: ArmState, parameters: LawParameters) -> tuple[TorqueLaw, LawReport]:
         """Gravity plus `K` times the error, minus damping."""
         n = state.position.shape[0]

@@ -9,7 +9,10 @@ from __future__ import annotations
 
 import torch
 
+from cotap.compliance.arguments import full_precision
 
+
+@full_precision
 def chain_compliance(
     axes: torch.Tensor, anchors: torch.Tensor, gains: torch.Tensor, point: torch.Tensor
 ) -> torch.Tensor:
@@ -26,6 +29,7 @@ def chain_compliance(
     return twist.transpose(-1, -2) @ (twist / gains.unsqueeze(-1))
 
 
+@full_precision
 def parallel(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     """Compliance (..., k, k) of two springs between the same bodies; either may be rigid in some directions."""
     total = a + b
@@ -53,6 +57,7 @@ def torso_compliance(legs: torch.Tensor, waist: torch.Tensor, contact: torch.Ten
     return torch.where(left | right, support, torch.zeros_like(support))
 
 
+@full_precision
 def hand_base_compliance(torso: torch.Tensor, lever: torch.Tensor) -> torch.Tensor:
     """`J_eb C_torso J_eb^T`, (N, A, 3, 3): how far hands move with the torso that carries them [m/N].
 
