@@ -45,10 +45,6 @@ class _SpdLog(torch.autograd.Function):
             return _log_derivative(log, _symmetric(gradient)), None, None
         return _last_log_derivative(values, vectors, _symmetric(gradient)), None, None
 
-
-class _SpdLogForward(_SpdLog):
-    """The same with forward-mode derivatives, which `torch.compile` refuses."""
-
     @staticmethod
     def jvp(ctx: Any, tangent: torch.Tensor, *_: None) -> torch.Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
         (log,) = ctx.saved_tensors
@@ -77,14 +73,19 @@ def _last_log_derivative(values: torch.Tensor, vectors: torch.Tensor, direction:
     return vectors @ (slope * (vectors.transpose(-1, -2) @ direction @ vectors)) @ vectors.transpose(-1, -2)
 
 
+# Were the compiler to look inside, second derivatives would be zero. To tell it so loads it, about a second of import.
+@torch.compiler.allow_in_graph
+def _apply_log(matrix: torch.Tensor, values: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
+    return cast(torch.Tensor, _SpdLog.apply(matrix, values, vectors))
+
+
 def _log(name: str, matrix: torch.Tensor) -> torch.Tensor:
     """Logarithm in float64 of the argument `name`, which is checked."""
     require_symmetric(name, matrix)
     whole = _symmetric(matrix.double())
     values, vectors = torch.linalg.eigh(whole.detach())
     require_positive_definite(name, values, matrix.dtype)
-    function = _SpdLog if torch.compiler.is_compiling() else _SpdLogForward
-    return cast(torch.Tensor, function.apply(whole, values, vectors))
+    return _apply_log(whole, values, vectors)
 
 
 def _exp(matrix: torch.Tensor) -> torch.Tensor:
