@@ -38,14 +38,13 @@ from mujoco import rollout
 
 from cotap.agents.actors import as_dict
 from cotap.agents.checkpoint import write_json
-from cotap.agents.dual_ppo import DualPPO
-from cotap.agents.runner import layout_of
+from cotap.agents.timing import TimedTraining
 from cotap.checks import require_positive_int, require_range
 from cotap.compliance import ArmKinematics
 from cotap.compliance.interface import ArmState, LawParameters
 from cotap.compliance.inverse_kinematics import ArmIK
 from cotap.compliance.laws import LAWS, LawConfig
-from cotap.configs import BASE_RECIPES, BaseTraining
+from cotap.configs import BASE_RECIPES
 from cotap.envs import HumanoidEnv
 from cotap.evaluation.policy import find_checkpoint, load_policy, shipped_names
 from cotap.motions import MotionClip, MotionLibrary
@@ -147,26 +146,6 @@ class EnvStepping:
             spent += time.perf_counter() - start
             steps += 1
         return steps * self.env.num_envs / spent
-
-
-class Training:
-    """Whole iterations: collecting and learning."""
-
-    def __init__(self, env: HumanoidEnv, training: BaseTraining) -> None:
-        self.env = env
-        self.alg = DualPPO(layout_of(env), env.num_envs, training.ppo)
-
-    def run(self) -> float:
-        alg, env = self.alg, self.env
-        start = time.perf_counter()
-        obs = as_dict(env.get_observations())
-        for _ in range(alg.cfg.steps):
-            obs, _, dones, extras = env.step(alg.act(obs))
-            obs = as_dict(obs)
-            alg.process_step(extras["group_rewards"], dones, extras["time_outs"])
-        alg.compute_returns(obs)
-        alg.update()
-        return alg.cfg.steps * env.num_envs / (time.perf_counter() - start)
 
 
 class Compliance:
@@ -410,7 +389,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     train_env = full_env(num_envs)  # of its own: an untrained policy falls, and would leave the other on the ground
     networks = {"default": "train", "paper": "train_paper"}
     for kind in options.networks:
-        parts[networks[kind]] = Training(train_env, BASE_RECIPES[kind]()).run
+        parts[networks[kind]] = TimedTraining(train_env, BASE_RECIPES[kind]().ppo).run
     parts["reference"] = Reference(num_envs, seconds, 0).run
     parts["reference_10000_clips"] = Reference(num_envs, seconds, 10_000).run
     parts["compliance"] = Compliance(num_envs, seconds).run

@@ -317,8 +317,8 @@ def test_a_command_line_is_obeyed_or_refused(
 ):
     """Up to where work would begin."""
     del in_tmp_path
-    monkeypatch.setattr(train, "_train", lambda _stage, options, _base: options.training.check())
-    monkeypatch.setattr(train, "train_both", lambda options: options.check())
+    monkeypatch.setattr(train, "_train", lambda _stage, options, _base: options.training.check() or Path("nowhere"))
+    monkeypatch.setattr(train, "train_both", lambda options, _run_stage: options.check())
 
     def check(_: str, options: Any) -> None:
         options.protocol.check()

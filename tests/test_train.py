@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import signal
 from dataclasses import fields
 from pathlib import Path
@@ -14,13 +15,14 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from cotap import train
+from cotap import pipeline, train
 from cotap.agents.checkpoint import load_checkpoint, save_checkpoint
 from cotap.agents.runner import sole_writer
 from cotap.configs import BASE_RECIPES, DISTILL_RECIPES, BaseTraining, from_plain
 from cotap.envs import HumanoidEnv
 from cotap.envs.rewards import LowerRewards, UpperRewards
 from cotap.evaluation import policy
+from cotap.pipeline import PipelineOptions
 
 # Every option that these tests use, as typed on the command line.
 ENVS = "--num-envs"
@@ -330,7 +332,7 @@ def test_names_with_underscores_and_the_last_of_two_options_count(
     path = checkpoint.with_name("other.pt")
     save_checkpoint(path, content)
     out: list[train.DistillOptions] = []
-    monkeypatch.setattr(train, "train_distill", out.append)
+    monkeypatch.setattr(train, "train_distill", lambda options: out.append(options) or Path("nowhere"))
     first = [BASE_CHECKPOINT, base / checkpoint.name] if twice else []
     assert run("distill", *first, "--base_checkpoint", path, "--num_envs=4", "--run_dir", tmp_path / "run") == 0
     assert out[0].base_checkpoint == str(path)
@@ -383,7 +385,7 @@ def test_sigterm_saves_and_exits_cleanly(tmp_path: Path, monkeypatch: pytest.Mon
 def captured(monkeypatch: pytest.MonkeyPatch, *args: Any) -> train.BaseOptions:
     """The options that a command line amounts to."""
     out: list[train.BaseOptions] = []
-    monkeypatch.setattr(train, "train_base", out.append)
+    monkeypatch.setattr(train, "train_base", lambda options: out.append(options) or Path("nowhere"))
     assert run(*args) == 0
     return out[0]
 
@@ -547,6 +549,7 @@ def test_stopped_in_a_stage_the_pipeline_ends_there_and_goes_on_from_there(
 ):
     """The second stage must not begin from half a first one."""
     tiny_networks(monkeypatch)
+    monkeypatch.setattr(pipeline, "expected", lambda _options: "")  # which steps environments, too
     out = tmp_path / "both"
     interrupt(monkeypatch, 3, signal.SIGINT)
     assert run(*BOTH, RUN_DIR, out) == 130
@@ -612,13 +615,26 @@ def test_without_a_stage_both_run_and_are_summed_up(tmp_path: Path, monkeypatch:
     assert newest(out / "base")["kind"] == "base"
     assert newest(out / "distill")["kind"] == "distill"
     said = capsys.readouterr().out
+    assert re.search(
+        r"\| base \| 384 \| [\d,]+ \| 0\.0 \|\n\| distill \| 192 \|", said
+    )  # beforehand, 24 steps an iteration
     assert "| base | 2 | 96 |" in said
     assert "| distill | 1 | 48 |" in said
+    assert f"cotap.play --checkpoint {out / 'distill' / 'checkpoint_000001.pt'}" in said
+
+
+def test_the_quick_pipeline_is_a_small_version_of_both(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    assert PipelineOptions(quick=True).iterations() == (1220, 610)
+    assert PipelineOptions().iterations() == (12_207, 6103)
+    tiny_networks(monkeypatch)
+    assert run("--quick", *BOTH, RUN_DIR, tmp_path) == 0
+    for stage in ("base", "distill"):
+        assert not newest(tmp_path / stage)["config"]["training"]["env"]["forces"]["pushes"]["enabled"]
 
 
 @pytest.mark.parametrize(
     ("options", "needle"),
-    [([ENVS, 0], "num_envs"), (["--base-iterations", 0], "base_iterations"), ([THREADS, -1], "threads")],
+    [([ENVS, 0], "num_envs"), (["--base-iterations", -1], "base_iterations"), ([THREADS, -1], "threads")],
 )
 def test_bad_options_of_both_stages_are_named(options: list[Any], needle: str, capsys: pytest.CaptureFixture[str]):
     assert run(*options) == 2

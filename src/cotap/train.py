@@ -16,7 +16,7 @@ from typing import Annotated, Any
 import tyro
 
 from cotap import __version__
-from cotap.checks import require_one_of, require_positive_int, require_range
+from cotap.checks import require_one_of
 from cotap.configs import (
     BASE_RECIPES,
     DISTILL_RECIPES,
@@ -26,6 +26,7 @@ from cotap.configs import (
     from_plain,
     to_plain,
 )
+from cotap.pipeline import STAGES, PipelineOptions, Stopped, next_commands, train_both
 from cotap.sim import resolve_backend
 
 SHORTCUTS = {
@@ -34,7 +35,6 @@ SHORTCUTS = {
     "--iterations": "--runner.iterations",
     "--backend": "--env.backend",
 }
-STAGES = ("base", "distill")
 
 
 @dataclass
@@ -79,47 +79,6 @@ class DistillOptions:
     training: Annotated[DistillTraining, tyro.conf.arg(name="")] = field(default_factory=DistillTraining)
 
 
-@dataclass
-class PipelineOptions:
-    """Both stages: a base policy, then its distillation under compliance. For more options:
-    `python -m cotap.train base --help`, `python -m cotap.train distill --help`."""
-
-    run_dir: str = ""
-    """Where the runs go, into folders `base` and `distill`; by default runs/cotap-DATE-TIME."""
-    robot: str = "h1"
-    """Name of the robot."""
-    resume: bool = False
-    """Go on with the runs in --run-dir: what is finished is left, what was stopped goes on, what is missing begins."""
-    num_envs: int = 1024
-    """Number of envs."""
-    base_iterations: int = 12_207
-    """Iterations of stage 1."""
-    distill_iterations: int = 6103
-    """Iterations of stage 2."""
-    seed: int = 0
-    """Seed of both stages."""
-    threads: int = 0
-    """CPU threads; 0 takes every core."""
-    backend: str = "auto"
-    """What simulates, in all stages: mjbatch (the CPU), warp (a GPU), or auto: warp where there is one
-    and the extra `warp`."""
-    device: str = "cpu"
-    """Where the networks live, in all stages."""
-
-    def check(self) -> None:
-        """Raise ValueError naming the first field that is out of its range."""
-        for name in ("num_envs", "base_iterations", "distill_iterations"):
-            require_positive_int(name, getattr(self, name))
-        require_range("threads", self.threads, 0, 4096)
-        resolve_backend(self.backend)
-        if self.resume and not self.run_dir:
-            raise ValueError("--resume goes on with the runs in --run-dir, which is not given")
-
-
-class Stopped(Exception):
-    """A stage was asked to stop before its end; the message says how to go on."""
-
-
 def main(argv: list[str] | None = None) -> int:
     """Parse, train, report. Returns the exit status: 0, 2 for bad input, 1 for a training that failed, 130 for both
     stages stopped before their end, or one before its checkpoint was saved."""
@@ -127,15 +86,10 @@ def main(argv: list[str] | None = None) -> int:
     stage = args.pop(0) if args and not args[0].startswith("-") else ""
     try:
         if not stage:
-            train_both(tyro.cli(PipelineOptions, args=args, prog="python -m cotap.train"))
+            train_both(tyro.cli(PipelineOptions, args=args, prog="python -m cotap.train"), run_stage)
             return 0
         require_one_of("stage", stage, STAGES)
-        options = _parse_base(args) if stage == "base" else _parse_distill(args)
-        options.command = " ".join(["python -m cotap.train", stage, *args])
-        if isinstance(options, BaseOptions):
-            train_base(options)
-        else:
-            train_distill(options)
+        print(next_commands(run_stage(stage, args)), end="")
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -150,6 +104,13 @@ def main(argv: list[str] | None = None) -> int:
         print("interrupted before the checkpoint was saved; the last one is whole", file=sys.stderr)
         return 130
     return 0
+
+
+def run_stage(stage: str, args: list[str]) -> Path:
+    """Train one stage, of arguments as they were typed. Returns the run directory."""
+    options = _parse_base(args) if stage == "base" else _parse_distill(args)
+    options.command = " ".join(["python -m cotap.train", stage, *args])
+    return train_base(options) if isinstance(options, BaseOptions) else train_distill(options)
 
 
 def _expand(args: list[str]) -> list[str]:
@@ -354,79 +315,6 @@ def _guide(env: Any, options: DistillOptions, base: dict[str, Any] | None) -> An
     if base is not None:
         take_over(options.base_checkpoint, base, model, env, options.recipe in OTHER_TERMS)
     return Guide(model.to(training.device), training.distillation)
-
-
-def train_both(options: PipelineOptions) -> Path:
-    """Run stage 1, then stage 2 from its result, and sum both up. Returns the directory of both.
-
-    Raises:
-        ValueError: an option is out of its range, or this is one of several processes.
-        Stopped: a stage was asked to stop.
-    """
-    from cotap.agents.ranks import Ranks
-
-    options.check()
-    if Ranks.from_environment().size > 1:
-        raise ValueError("several processes train stage by stage: python -m cotap.train base, then distill")
-    run_dir = Path(options.run_dir) if options.run_dir else _new_run_dir("cotap")
-    base = _part(options, run_dir / "base", "base", options.base_iterations, ["--robot", options.robot])
-    _part(options, run_dir / "distill", "distill", options.distill_iterations, ["--base-checkpoint", str(base)])
-    print(_summary(run_dir))
-    return run_dir
-
-
-def _part(options: PipelineOptions, run_dir: Path, stage: str, iterations: int, begin: list[str]) -> Path:
-    """Run one part of the pipeline as if typed, up to so many iterations; with `begin` unless it goes on.
-
-    Returns its newest checkpoint. Raises Stopped if that is not its last.
-    """
-    from cotap.agents.checkpoint import load_checkpoint
-
-    newest = _newest(run_dir) if options.resume else None
-    args = [
-        "--num-envs", str(options.num_envs), "--seed", str(options.seed), "--threads", str(options.threads),
-        "--backend", options.backend, "--device", options.device, "--iterations", str(iterations),
-        "--run-dir", str(run_dir), *(["--resume", str(newest)] if newest else begin),
-    ]  # fmt: skip
-    command = " ".join(["python -m cotap.train", stage, *args])
-    if stage == "base":
-        base = _parse_base(args)
-        base.command = command
-        train_base(base)
-    else:
-        distill = _parse_distill(args)
-        distill.command = command
-        train_distill(distill)
-    newest = _newest(run_dir)
-    assert newest, f"{run_dir} holds no checkpoint of a stage that ended"
-    reached = load_checkpoint(newest)["iteration"]
-    if reached < iterations:
-        raise Stopped(
-            f"stopped at iteration {reached} of {iterations} of {run_dir}; the same command with "
-            f"--run-dir {run_dir.parent} --resume goes on"
-        )
-    return newest
-
-
-def _newest(run_dir: Path) -> Path | None:
-    from cotap.agents.runner import CHECKPOINT_PATTERN
-
-    return max(run_dir.glob(CHECKPOINT_PATTERN), default=None)
-
-
-def _summary(run_dir: Path) -> str:
-    """What each stage took, as a Markdown table."""
-    from cotap.agents.checkpoint import load_checkpoint
-
-    lines = ["| run | iterations | samples | seconds | checkpoint |", "|---|---|---|---|---|"]
-    for part in STAGES:
-        path = _newest(run_dir / part)
-        assert path, f"{run_dir / part} holds no checkpoint"
-        content = load_checkpoint(path)
-        lines.append(
-            f"| {part} | {content['iteration']} | {content['samples']:,} | {content['wall_seconds']:.0f} | {path} |"
-        )
-    return "\n".join(lines)
 
 
 def provenance(command: str, backend: str) -> dict[str, str]:

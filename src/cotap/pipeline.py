@@ -1,0 +1,184 @@
+"""Both stages of training, one after the other: what `python -m cotap.train` does without a stage."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from cotap.checks import require_positive_int, require_range
+from cotap.configs import BASE_RECIPES, DISTILL_RECIPES, BaseTraining, DistillTraining
+from cotap.sim import resolve_backend
+
+STAGES = ("base", "distill")
+QUICK_DISTILL_ITERATIONS = 610
+"""Of a distillation that only shows that it works; 15 M samples at 1024 envs."""
+
+RunStage = Callable[[str, list[str]], Path]
+"""Trains one stage, given its name and its arguments as if typed, and returns its directory."""
+
+
+@dataclass
+class PipelineOptions:
+    """Both stages: a base policy, then its distillation under compliance. For more options:
+    `python -m cotap.train base --help`, `python -m cotap.train distill --help`."""
+
+    run_dir: str = ""
+    """Where the runs go, into folders `base` and `distill`; by default runs/cotap-DATE-TIME."""
+    robot: str = "h1"
+    """Name of the robot."""
+    quick: bool = False
+    """A small version of both: walking without loads and pushes, and the beginnings of compliance."""
+    resume: bool = False
+    """Go on with the runs in --run-dir: what is finished is left, what was stopped goes on, what is missing begins."""
+    num_envs: int = 1024
+    """Number of envs."""
+    base_iterations: int = 0
+    """Iterations of stage 1; 0 for the recipe's."""
+    distill_iterations: int = 0
+    """Iterations of stage 2; 0 for the recipe's, or for 610 with --quick."""
+    seed: int = 0
+    """Seed of both stages."""
+    threads: int = 0
+    """CPU threads; 0 takes every core."""
+    backend: str = "auto"
+    """What simulates, in all stages: mjbatch (the CPU), warp (a GPU), or auto: warp where there is one
+    and the extra `warp`."""
+    device: str = "cpu"
+    """Where the networks live, in all stages."""
+
+    def check(self) -> None:
+        """Raise ValueError naming the first field that is out of its range."""
+        require_positive_int("num_envs", self.num_envs)
+        for name in ("base_iterations", "distill_iterations"):
+            require_range(name, getattr(self, name), 0, 1e9)
+        require_range("threads", self.threads, 0, 4096)
+        resolve_backend(self.backend)
+        if self.resume and not self.run_dir:
+            raise ValueError("--resume goes on with the runs in --run-dir, which is not given")
+
+    def iterations(self) -> tuple[int, int]:
+        """Of both stages."""
+        base, distill = self._trainings()
+        return base.runner.iterations, distill.runner.iterations
+
+    def _trainings(self) -> tuple[BaseTraining, DistillTraining]:
+        """Both configurations."""
+        base = BASE_RECIPES["quick" if self.quick else "default"]()
+        base.env.robot, base.env.num_envs, base.env.backend = self.robot, self.num_envs, self.backend
+        base.env.num_threads = self.threads
+        distill = DISTILL_RECIPES["default"](base)
+        if self.quick:
+            distill.runner.iterations = QUICK_DISTILL_ITERATIONS
+        base.runner.iterations = self.base_iterations or base.runner.iterations
+        distill.runner.iterations = self.distill_iterations or distill.runner.iterations
+        return base, distill
+
+
+class Stopped(Exception):
+    """A stage was asked to stop before its end; the message says how to go on."""
+
+
+def train_both(options: PipelineOptions, run_stage: RunStage) -> Path:
+    """Run stage 1, then stage 2 from its result, and sum both up. Returns the directory of both.
+
+    Args:
+        options: Of both stages.
+        run_stage: Trains one of them.
+
+    Raises:
+        ValueError: an option is out of its range, or this is one of several processes.
+        Stopped: a stage was asked to stop.
+    """
+    from cotap.agents.ranks import Ranks
+
+    options.check()
+    if Ranks.from_environment().size > 1:
+        raise ValueError("several processes train stage by stage: python -m cotap.train base, then distill")
+    run_dir = Path(options.run_dir or time.strftime("runs/cotap-%Y%m%d-%H%M%S"))
+    base_steps, distill_steps = options.iterations()
+    if not options.resume:
+        print(expected(options), flush=True)
+    recipe = ["--recipe", "quick"] if options.quick else []
+    base = _part(options, run_dir / "base", base_steps, ["--robot", options.robot, *recipe], run_stage)
+    _part(options, run_dir / "distill", distill_steps, ["--base-checkpoint", str(base)], run_stage)
+    print(_summary(run_dir), end="")
+    return run_dir
+
+
+def expected(options: PipelineOptions) -> str:
+    """What both stages will take on this machine, by one iteration of each, as a Markdown table."""
+    import torch
+
+    from cotap.agents.timing import TimedTraining
+    from cotap.envs import HumanoidEnv
+
+    if options.threads:
+        torch.set_num_threads(options.threads)
+    lines = ["| stage | samples | samples/s here | hours |", "|---|---|---|---|"]
+    for stage, training in zip(STAGES, options._trainings(), strict=True):
+        timed = TimedTraining(HumanoidEnv(training.env), training.ppo, options.device)
+        timed.run()  # warm up
+        rate = timed.run()
+        samples = training.runner.iterations * training.ppo.steps * options.num_envs
+        lines.append(f"| {stage} | {samples:,} | {rate:,.0f} | {samples / rate / 3600.0:.1f} |")
+    return "\n".join(lines)
+
+
+def _part(options: PipelineOptions, run_dir: Path, iterations: int, begin: list[str], run_stage: RunStage) -> Path:
+    """Run one part of the pipeline, up to so many iterations; with `begin` unless it goes on.
+
+    Returns its newest checkpoint. Raises Stopped if that is not its last.
+    """
+    from cotap.agents.checkpoint import load_checkpoint
+
+    newest = _newest(run_dir) if options.resume else None
+    run_stage(run_dir.name, [
+        "--num-envs", str(options.num_envs), "--seed", str(options.seed), "--threads", str(options.threads),
+        "--backend", options.backend, "--device", options.device, "--iterations", str(iterations),
+        "--run-dir", str(run_dir), *(["--resume", str(newest)] if newest else begin),
+    ])  # fmt: skip
+    newest = _newest(run_dir)
+    assert newest, f"{run_dir} holds no checkpoint of a stage that ended"
+    reached = load_checkpoint(newest)["iteration"]
+    if reached < iterations:
+        raise Stopped(
+            f"stopped at iteration {reached} of {iterations} of {run_dir}; the same command with "
+            f"--run-dir {run_dir.parent} --resume goes on"
+        )
+    return newest
+
+
+def _newest(run_dir: Path) -> Path | None:
+    from cotap.agents.runner import CHECKPOINT_PATTERN
+
+    return max(run_dir.glob(CHECKPOINT_PATTERN), default=None)
+
+
+def _summary(run_dir: Path) -> str:
+    """What each stage took, as a Markdown table, and what to type next."""
+    from cotap.agents.checkpoint import load_checkpoint
+
+    lines = ["| run | iterations | samples | seconds | checkpoint |", "|---|---|---|---|---|"]
+    for part in STAGES:
+        path = _newest(run_dir / part)
+        assert path, f"{run_dir / part} holds no checkpoint"
+        content = load_checkpoint(path)
+        lines.append(
+            f"| {part} | {content['iteration']} | {content['samples']:,} | {content['wall_seconds']:.0f} | {path} |"
+        )
+    return "\n".join(lines) + "\n" + next_commands(run_dir / STAGES[-1])
+
+
+def next_commands(run_dir: Path) -> str:
+    """What a user may want to type after a training; nothing where it saved no checkpoint."""
+    newest = _newest(run_dir)
+    if newest is None:
+        return ""
+    commands = (
+        f"tensorboard --logdir {run_dir}",
+        f"python -m cotap.play --checkpoint {newest}",
+        f"python -m cotap.evaluate velocity-tracking --checkpoint {newest}",
+    )
+    return "\nNext:\n" + "".join(f"  {command}\n" for command in commands)
