@@ -22,7 +22,7 @@ def test_positive_int_refuses(value):
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 10**400, -(10**400), True, "1.0", None])
 def test_finite_refuses(value):
-    with pytest.raises(ValueError, match=re.escape(f"gain must be a finite number, got {value!r}")):
+    with pytest.raises(ValueError, match=re.escape(f"gain must be a finite number, got {checks.quoted(value)}")):
         checks.require_finite("gain", value)
 
 

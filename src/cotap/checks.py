@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import reprlib
 from collections.abc import Collection
 from typing import TYPE_CHECKING, TypeGuard
 
@@ -11,17 +12,38 @@ if TYPE_CHECKING:
     import torch
 
 
+def quoted(value: object, longest: int = 100) -> str:
+    """A value in an error: as Python writes it, but short, however long or deep it is."""
+    short = reprlib.Repr()
+    short.maxlevel, short.maxstring, short.maxother, short.maxlong = 3, longest, longest, longest
+    try:
+        return short.repr(value)
+    except ValueError:  # Python does not write out integers of many thousand digits
+        return f"a {type(value).__name__} too long to show"
+
+
+def shortened(text: str, longest: int = 2000) -> str:
+    """A message without its middle if it is longer than that: what a file holds may be in it, whole."""
+    half = longest // 2
+    return text if len(text) <= longest else f"{text[:half]} ... {text[-half:]}"
+
+
+def legible(text: str, longest: int = 200) -> str:
+    """A name from a file, to be printed: as it is, or as `quoted` has it if it is long or no terminal should get it."""
+    return text if len(text) <= longest and text.isprintable() else quoted(text, longest)
+
+
 def require_positive_int(name: str, value: int) -> int:
     """Return `value` if it is an integer >= 1, else raise ValueError."""
     if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-        raise ValueError(f"{name} must be a positive integer, got {value!r}")
+        raise ValueError(f"{name} must be a positive integer, got {quoted(value)}")
     return value
 
 
 def require_seed(name: str, value: int) -> int:
     """Return `value` if every random number generator takes it as a seed, else raise ValueError."""
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= 2**62:
-        raise ValueError(f"{name} must be an integer from 0 to 2**62, got {value!r}")
+        raise ValueError(f"{name} must be an integer from 0 to 2**62, got {quoted(value)}")
     return value
 
 
@@ -36,7 +58,7 @@ def is_finite(value: object) -> TypeGuard[float]:
 def require_finite(name: str, value: float) -> float:
     """Return `value` if it is a finite number, else raise ValueError."""
     if not is_finite(value):
-        raise ValueError(f"{name} must be a finite number, got {value!r}")
+        raise ValueError(f"{name} must be a finite number, got {quoted(value)}")
     return value
 
 
@@ -44,17 +66,17 @@ def require_range(name: str, value: float, low: float, high: float) -> float:
     """Return `value` if it lies in [low, high], else raise ValueError."""
     require_finite(name, value)
     if not low <= value <= high:
-        raise ValueError(f"{name} must lie in [{low}, {high}], got {value!r}")
+        raise ValueError(f"{name} must lie in [{low}, {high}], got {quoted(value)}")
     return value
 
 
 def require_interval(name: str, value: tuple[float, float]) -> tuple[float, float]:
     """Return `value` if it is a pair of finite numbers (low, high) with low <= high."""
     if len(value) != 2:
-        raise ValueError(f"{name} must be a pair (low, high), got {value!r}")
+        raise ValueError(f"{name} must be a pair (low, high), got {quoted(value)}")
     low, high = (require_finite(f"{name}[{i}]", v) for i, v in enumerate(value))
     if low > high:
-        raise ValueError(f"{name} must have low <= high, got {value!r}")
+        raise ValueError(f"{name} must have low <= high, got {quoted(value)}")
     return value
 
 
@@ -66,9 +88,9 @@ def reason_of(error: BaseException) -> str:
 def require_one_of(name: str, value: str, known: Collection[str]) -> str:
     """Return `value` if it is among the `known` names; the error lists them and the closest."""
     if value not in known:
-        close = difflib.get_close_matches(str(value), list(known), n=1)
+        close = difflib.get_close_matches(str(value)[:100], list(known), n=1)
         hint = f" (did you mean {close[0]!r}?)" if close else ""
-        raise ValueError(f"{name} {value!r} is unknown{hint}; known: {', '.join(sorted(known))}")
+        raise ValueError(f"{name} {quoted(value)} is unknown{hint}; known: {', '.join(sorted(known))}")
     return value
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import tyro
 
-from cotap.checks import require_positive_int, require_seed
+from cotap.checks import require_positive_int, require_seed, shortened
 from cotap.deployment.engines import EngineConfig
 from cotap.deployment.robot import Perturbations
 from cotap.deployment.safety import SafetyConfig
@@ -60,7 +60,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         deploy(options)
     except (ValueError, OSError, ModuleNotFoundError) as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {shortened(str(error))}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         return 130

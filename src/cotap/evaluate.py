@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import tyro
 
-from cotap.checks import require_one_of, require_range
+from cotap.checks import require_one_of, require_range, shortened
 from cotap.configs import to_plain
 from cotap.evaluation.disturbance import ConstantLoad, Impact
 from cotap.evaluation.fall_curve import FallCurve
@@ -98,7 +98,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         evaluate(args)
     except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {shortened(str(error))}", file=sys.stderr)
         return 2
     return 0
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import tyro
 
-from cotap.checks import require_positive_int, require_seed
+from cotap.checks import require_positive_int, require_seed, shortened
 from cotap.files import require_output
 
 
@@ -43,10 +43,10 @@ def main(argv: list[str] | None = None) -> int:
         checkpoint = find_checkpoint(options.checkpoint) if options.checkpoint else default_checkpoint()
         summary, worst = export_policy(checkpoint, output, options.checks, options.seed)
     except (ValueError, OSError, ModuleNotFoundError) as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {shortened(str(error))}", file=sys.stderr)
         return 2
     except ArithmeticError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {shortened(str(error))}", file=sys.stderr)
         return 1
     print(f"{output}: {summary}; differs from torch by at most {worst:.1e} over {options.checks} observations")
     return 0

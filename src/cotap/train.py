@@ -16,7 +16,7 @@ from typing import Annotated, Any
 import tyro
 
 from cotap import __version__
-from cotap.checks import require_one_of
+from cotap.checks import require_one_of, shortened
 from cotap.configs import (
     BASE_RECIPES,
     DISTILL_RECIPES,
@@ -91,11 +91,11 @@ def main(argv: list[str] | None = None) -> int:
         require_one_of("stage", stage, STAGES)
         print(next_commands(run_stage(stage, args)), end="")
     except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {shortened(str(error))}", file=sys.stderr)
         return 2
     except RuntimeError as error:  # an iteration failed, or the frozen base was found changed
         traceback.print_exception(error.__cause__ or error)
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {shortened(str(error))}", file=sys.stderr)
         return 1
     except Stopped as stop:
         print(stop, file=sys.stderr)

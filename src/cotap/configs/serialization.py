@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import reprlib
 import typing
 from typing import Any, TypeVar
+
+from cotap.checks import quoted
 
 T = TypeVar("T")
 
@@ -32,7 +33,7 @@ def from_plain(cls: type[T], data: dict[str, Any], where: str = "") -> T:
     names = [f.name for f in dataclasses.fields(cls)]  # pyright: ignore[reportArgumentType]
     unknown = sorted(str(name) for name in data if name not in names)
     if unknown:
-        raise ValueError(f"{cls.__name__} has no field {unknown[0]!r}; known: {', '.join(names)}")
+        raise ValueError(f"{cls.__name__} has no field {quoted(unknown[0])}; known: {', '.join(names)}")
     prefix = f"{where}." if where else ""
     return cls(**{name: _value(hints[name], data[name], prefix + name) for name in names if name in data})
 
@@ -61,4 +62,4 @@ def _items(hint: Any, value: Any, where: str) -> tuple[Any, ...]:
 
 def _shown(value: Any) -> str:
     """A value in an error, however long or deep it is."""
-    return f"{type(value).__name__} {reprlib.repr(value)}"
+    return f"{type(value).__name__} {quoted(value)}"

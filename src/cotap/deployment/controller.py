@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 
+from cotap.checks import quoted
 from cotap.compliance.kinematics import ChainPose
 from cotap.compliance.laws import SENSING_FORCE
 from cotap.configs import from_plain
@@ -45,7 +46,7 @@ def robot_of(metadata: PolicyMetadata) -> RobotSpec:
         PolicyError: cotap does not know it, or knows it with another value of an entry that is the robot's own.
     """
     if metadata.robot not in ROBOTS:
-        raise PolicyError(f"the policy is for the robot {metadata.robot!r}; known: {', '.join(ROBOTS)}")
+        raise PolicyError(f"the policy is for the robot {quoted(metadata.robot)}; known: {', '.join(ROBOTS)}")
     spec = ROBOTS[metadata.robot]()
     own = {
         "joints": list(spec.joint_names),

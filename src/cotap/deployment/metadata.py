@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-import reprlib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
-from cotap.checks import is_finite, require_one_of, require_positive_int, require_range
+from cotap.checks import is_finite, legible, quoted, require_one_of, require_positive_int, require_range
 
 FORMAT = "cotap-policy-2"
 INPUT, TARGETS = "observation", "joint_targets"
@@ -98,7 +97,7 @@ def read_metadata(where: str, properties: Mapping[str, str]) -> PolicyMetadata:
 
 def _check(m: PolicyMetadata) -> None:
     if m.format != FORMAT:
-        raise ValueError(f"format is {m.format!r}; this cotap reads {FORMAT!r}")
+        raise ValueError(f"format is {quoted(m.format)}; this cotap reads {FORMAT!r}")
     for name in ("robot", "stage", "checkpoint_sha256", "cotap_version"):
         _require(isinstance(getattr(m, name), str), name, "a text", getattr(m, name))
     for name in ("action", "observation", "gait", "commands", "terminations", "law"):
@@ -132,8 +131,8 @@ def _check_observation(observation: dict[str, Any]) -> None:
     _require(isinstance(terms, list), "observation.terms", "a list", terms)
     for term in terms:
         if not (isinstance(term, list) and len(term) == 3 and isinstance(term[0], str) and is_finite(term[2])):
-            raise ValueError(f"metadata observation has a term that is not (name, width, scale): {term}")
-        require_positive_int(f"metadata observation: width of {term[0]}", term[1])
+            raise ValueError(f"metadata observation has a term that is not (name, width, scale): {quoted(term)}")
+        require_positive_int(f"metadata observation: width of {legible(term[0])}", term[1])
 
 
 def _check_per_joint(name: str, values: Any, count: int) -> None:
@@ -141,9 +140,9 @@ def _check_per_joint(name: str, values: Any, count: int) -> None:
     if len(values) != count:
         raise ValueError(f"metadata {name} has {len(values)} entries for {count} joints")
     if not all(is_finite(v) for v in values):
-        raise ValueError(f"metadata {name} holds what is not a finite number: {values}")
+        raise ValueError(f"metadata {name} holds what is not a finite number: {quoted(values)}")
 
 
 def _require(fits: bool, name: str, what: str, value: Any) -> None:
     if not fits:
-        raise ValueError(f"metadata {name} must be {what}, got {reprlib.repr(value)}")
+        raise ValueError(f"metadata {name} must be {what}, got {quoted(value)}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from dataclasses import dataclass, fields, replace
 
-from cotap.checks import require_one_of, require_range
+from cotap.checks import quoted, require_one_of, require_range
 from cotap.compliance.laws import LAWS, LawConfig
 from cotap.envs.upper_body import LawSampling, UpperBodyConfig
 
@@ -85,7 +85,7 @@ def parse_law(option: str, text: str, common: LawConfig) -> LawConfig:
         try:
             numbers = tuple(float(v) for v in value.split("x"))
         except ValueError as error:
-            raise ValueError(f"--{option}: {key} must be a number, got {value!r}") from error
+            raise ValueError(f"--{option}: {key} must be a number, got {quoted(value)}") from error
         law = replace(law, **{key: _three(numbers) if key == "stiffness" else _one(option, key, numbers)})
     return law
 

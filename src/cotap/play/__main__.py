@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from cotap.checks import require_one_of
+from cotap.checks import require_one_of, shortened
 from cotap.play import ROBOTS
 from cotap.play.startup import import_tensordict, uncollected
 
@@ -47,7 +47,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         return _run(options)
     except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {shortened(str(error))}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("stopped")

@@ -10,6 +10,7 @@ from typing import Any
 
 import viser
 
+from cotap.checks import quoted
 from cotap.evaluation.recording import Recording, RecordingError
 from cotap.play.archive import Archive
 from cotap.play.controls import SPEED, Number, Refused
@@ -37,12 +38,14 @@ class Replay:
     def __init__(self, server: viser.ViserServer, recording: Recording, path: Path) -> None:
         robot = recording.settings.get("robot")
         if robot not in KNOWN_ROBOTS:
-            raise RecordingError(f"the recording's robot {robot!r} is unknown; known: {', '.join(KNOWN_ROBOTS)}")
+            raise RecordingError(f"the recording's robot {quoted(robot)} is unknown; known: {', '.join(KNOWN_ROBOTS)}")
         self._samples, self._dt = samples_of(recording), recording.trajectory.dt
         spec = KNOWN_ROBOTS[robot]()
         width, sides = recording.scene["qpos"].shape[2], recording.settings["sides"]
         if width != 7 + len(spec.joints) or sides != [arm.side for arm in spec.arms]:
-            raise RecordingError(f"a recording of {width} positions and the hands {sides} is of no {spec.name!r}")
+            raise RecordingError(
+                f"a recording of {width} positions and the hands {quoted(sides)} is of no {spec.name!r}"
+            )
         self._count = recording.trajectory.fell.shape[1]
         self._stop = threading.Event()
         self.scene = Scene(server, spec, self._count)
