@@ -11,7 +11,8 @@ from typing import Annotated, Any
 
 import tyro
 
-from cotap.checks import is_finite
+from cotap.checks import is_finite, quoted, shortened
+from cotap.inputs import InputError, read_text
 
 
 @dataclass
@@ -39,16 +40,18 @@ def main(argv: list[str] | None = None) -> int:
         if options.json:
             write_json(Path(options.json), result)
     except (ValueError, OSError, RecursionError) as error:  # the last of settings nested without end
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {shortened(str(error))}", file=sys.stderr)
         return 2
     return 0
 
 
 def read(path: str) -> dict[str, Any]:
-    """An evaluation's JSON. Raises ValueError for another file, OSError for none."""
+    """An evaluation's JSON. Raises ValueError for another file, or none."""
     try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:  # not JSON, not text, or nested without end
+        content = json.loads(read_text(path))
+    except InputError as error:
+        raise ValueError(f"{path!r} {error}") from error
+    except (ValueError, RecursionError) as error:  # not JSON, or nested without end
         raise ValueError(f"{path!r} is not JSON: {error}") from error
     if not isinstance(content, dict) or not {"protocol", "metrics", "settings"} <= content.keys():
         raise ValueError(f"{path!r} is not an evaluation: it lacks protocol, metrics or settings")
@@ -69,10 +72,10 @@ def _require_summary(where: str, summary: Any) -> None:
         raise ValueError(f"{where} must have mean and ci95")
     mean, interval = summary["mean"], summary["ci95"]
     if mean is not None and not is_finite(mean):
-        raise ValueError(f"{where}.mean must be a finite number or null, got {mean!r:.80}")
+        raise ValueError(f"{where}.mean must be a finite number or null, got {quoted(mean)}")
     pair = isinstance(interval, list) and len(interval) == 2 and all(is_finite(x) for x in interval)
     if interval is not None and not pair:
-        raise ValueError(f"{where}.ci95 must be two finite numbers or null, got {interval!r:.80}")
+        raise ValueError(f"{where}.ci95 must be two finite numbers or null, got {quoted(interval)}")
 
 
 def _require_envs(where: str, envs: Any) -> None:
@@ -83,9 +86,9 @@ def _require_envs(where: str, envs: Any) -> None:
         if len(values) != len(envs["stood"]):
             raise ValueError(f"{where}.{name} has {len(values)} envs, stood has {len(envs['stood'])}")
         if wrong := [v for v in values if v is not None and not is_finite(v)]:
-            raise ValueError(f"{where}.{name} must be finite numbers or null, got {wrong[0]!r:.80}")
+            raise ValueError(f"{where}.{name} must be finite numbers or null, got {quoted(wrong[0])}")
     if wrong := [v for v in envs["stood"] if v not in (0, 1)]:
-        raise ValueError(f"{where}.stood must be 0 or 1, got {wrong[0]!r:.80}")
+        raise ValueError(f"{where}.stood must be 0 or 1, got {quoted(wrong[0])}")
 
 
 def compare(a: dict[str, Any], b: dict[str, Any], without_falls: bool = False) -> dict[str, Any]:
@@ -100,7 +103,7 @@ def compare(a: dict[str, Any], b: dict[str, Any], without_falls: bool = False) -
         ValueError: the protocols differ.
     """
     if a["protocol"] != b["protocol"]:
-        raise ValueError(f"protocols differ: {a['protocol']!r} and {b['protocol']!r}")
+        raise ValueError(f"protocols differ: {quoted(a['protocol'])} and {quoted(b['protocol'])}")
     key = "metrics_without_falls" if without_falls else "metrics"
     names = [name for name in a.get(key, {}) if name in b.get(key, {})]
     rows = {name: measure_difference(a, b, name, without_falls) for name in names}

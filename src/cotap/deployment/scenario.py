@@ -9,12 +9,13 @@ from typing import Any
 
 import torch
 
-from cotap.checks import require_finite, require_range
+from cotap.checks import legible, quoted, require_finite, require_range
 from cotap.compliance.laws import LawConfig
 from cotap.configs import from_plain
 from cotap.envs.commands import CommandSource
 from cotap.envs.scripted_forces import ForceProfile, ScriptedForces
 from cotap.evaluation.law_options import parse_law
+from cotap.inputs import InputError, read_text
 from cotap.motions.reference import ReferenceConfig, ReferenceMotion
 from cotap.robots import RobotSpec
 
@@ -22,6 +23,9 @@ if sys.version_info >= (3, 11):
     import tomllib
 else:
     import tomli as tomllib
+
+_LARGEST = 1 << 20
+"""Bytes of a scenario that are read; a command takes a hundred."""
 
 
 @dataclass
@@ -48,7 +52,7 @@ class TimedCommand:
         require_range(f"{where}.yaw_rate", self.yaw_rate, -5.0, 5.0)
         require_range(f"{where}.height_offset", self.height_offset, -0.5, 0.0)
         if not isinstance(self.stand, bool):
-            raise ValueError(f"{where}.stand must be true or false, got {self.stand!r}")
+            raise ValueError(f"{where}.stand must be true or false, got {quoted(self.stand)}")
         if self.stand and (any(self.velocity) or self.yaw_rate):
             raise ValueError(f"{where} stands and moves: velocity {self.velocity}, yaw_rate {self.yaw_rate}")
 
@@ -79,7 +83,7 @@ class ArmMotion:
             joint = spec.joints[spec.indices([name])[0]]
             require_range(f"arms.pose[{i}] ({name})", value, *joint.range_rad)
         if not isinstance(self.clip, str):
-            raise ValueError(f"arms.clip must be a name, got {self.clip!r}")
+            raise ValueError(f"arms.clip must be a name, got {quoted(self.clip)}")
 
     def reference(self, spec: RobotSpec, dt: float) -> ReferenceMotion:
         """The reference of one robot. Raises MotionError for a clip that is not there."""
@@ -127,7 +131,7 @@ class Scenario:
             except ValueError as error:
                 raise ValueError(f"force[{i}]: {error}") from error
             if force.place != "hand":
-                raise ValueError(f"force[{i}].place must be 'hand' in a scenario, got {force.place!r}")
+                raise ValueError(f"force[{i}].place must be 'hand' in a scenario, got {quoted(force.place)}")
             for axis, value in enumerate(force.force):
                 require_finite(f"force[{i}].force[{axis}]", value)
 
@@ -144,19 +148,19 @@ def load_scenario(path: Path | str, spec: RobotSpec) -> Scenario:
     """Read a scenario from TOML.
 
     Raises:
-        ValueError: the file is missing, is not TOML, or has a field that is unknown or out of its range; the message
-            names the file and the field.
+        ValueError: the file cannot be read, is not TOML, or has a field that is unknown or out of its range; the
+            message names the file and the field.
     """
     try:
-        data = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise ValueError(f"scenario {str(path)!r} does not exist") from error
-    except (ValueError, RecursionError) as error:  # not text, not TOML, or nested without end
-        raise ValueError(f"scenario {str(path)!r} is not TOML: {error}") from error
+        data = tomllib.loads(read_text(path, _LARGEST))
+    except InputError as error:
+        raise ValueError(f"scenario {str(path)!r} {error}") from error
+    except (ValueError, RecursionError) as error:  # not TOML, or nested without end
+        raise ValueError(f"scenario {str(path)!r} is not TOML: {legible(str(error))}") from error
     try:
         scenario = from_plain(Scenario, data)
         if not isinstance(scenario.arms, ArmMotion):
-            raise ValueError(f"arms must be a table, got {scenario.arms!r}")
+            raise ValueError(f"arms must be a table, got {quoted(scenario.arms)}")
         scenario.check(spec)
     except (ValueError, TypeError) as error:
         raise ValueError(f"scenario {str(path)!r}: {error}") from error
@@ -165,4 +169,4 @@ def load_scenario(path: Path | str, spec: RobotSpec) -> Scenario:
 
 def _require_length(name: str, value: Any, length: int) -> None:
     if not isinstance(value, (tuple, list)) or len(value) != length:
-        raise ValueError(f"{name} must hold {length} numbers, got {value!r}")
+        raise ValueError(f"{name} must hold {length} numbers, got {quoted(value)}")

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,11 +11,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from cotap.checks import reason_of, require_finite, require_range
+from cotap.checks import legible, quoted, reason_of, require_finite, require_range
 from cotap.evaluation.disturbance import response_measures, window_measures
 from cotap.evaluation.metrics import summarize, tracking_measures
 from cotap.evaluation.rollout import STEPPED, Trajectory
 from cotap.files import write_arrays
+from cotap.inputs import InputError, read_arrays
 
 FORMAT, VERSION = "cotap-recording", 2
 SCENE: dict[str, tuple[str | int, ...]] = {
@@ -40,6 +39,10 @@ _LEVELS = 8
 """How deep settings may be nested; five levels are in use."""
 MAX_BYTES = 4 << 30
 """Largest size of a recording's arrays; an hour of two robots takes half of it."""
+
+
+_ENTRIES = ("head", "trajectory.dt", *(f"trajectory.{n}" for n in STEPPED), *(f"scene.{n}" for n in SCENE))
+"""What is in the file."""
 
 
 class RecordingError(ValueError):
@@ -72,40 +75,29 @@ def load_recording(path: Path | str) -> Recording:
     Raises:
         RecordingError: the file is missing, truncated, foreign, of another version, or its arrays do not fit together.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise RecordingError(f"recording {str(path)!r} does not exist")
     try:
-        arrays = _read(path)
-        head = json.loads(str(arrays.pop("head")))
-        kind, version = head["format"], head["version"]
-        settings = head["settings"]
-    except OSError as error:
-        raise RecordingError(f"recording {str(path)!r} cannot be read from disk: {error}") from error
-    except Exception as error:  # zip, zlib, numpy and JSON each fail in ways of their own on rubbish
-        raise RecordingError(f"{str(path)!r} is not a cotap recording, or is truncated: {reason_of(error)}") from error
+        arrays = read_arrays(path, _ENTRIES, MAX_BYTES)
+    except InputError as error:
+        raise RecordingError(f"recording {str(path)!r} {error}") from error
+    try:
+        head = json.loads(str(arrays.pop("head", "{}")))
+        kind, version, settings = (head[name] for name in ("format", "version", "settings"))
+    except KeyError as error:
+        raise RecordingError(f"{str(path)!r} is not a cotap recording: it lacks {error}") from error
+    except (ValueError, TypeError, RecursionError) as error:  # no JSON, or none of a table
+        raise RecordingError(f"{str(path)!r} is not a cotap recording: {legible(reason_of(error))}") from error
     if kind != FORMAT or version != VERSION:
-        raise RecordingError(f"{str(path)!r} is a {kind!r} of version {version!r}; this cotap reads {FORMAT} {VERSION}")
+        raise RecordingError(
+            f"{str(path)!r} is a {quoted(kind)} of version {quoted(version)}; this cotap reads {FORMAT} {VERSION}"
+        )
     try:
         return _assemble(arrays, settings)
     except ValueError as error:
         raise RecordingError(f"recording {str(path)!r}: {error}") from error
 
 
-def _read(path: Path) -> dict[str, np.ndarray]:
-    with zipfile.ZipFile(path) as archive:
-        size = sum(info.file_size for info in archive.infolist())
-        if size > MAX_BYTES:
-            raise ValueError(f"its arrays take {size} bytes; at most {MAX_BYTES} are read")
-        return {
-            info.filename.removesuffix(".npy"): np.load(io.BytesIO(archive.read(info)), allow_pickle=False)
-            for info in archive.infolist()
-        }
-
-
 def _assemble(arrays: dict[str, np.ndarray], settings: Any) -> Recording:
-    missing = [n for n in ("trajectory.dt", *(f"trajectory.{n}" for n in STEPPED), *(f"scene.{n}" for n in SCENE))
-               if n not in arrays]  # fmt: skip
+    missing = [name for name in _ENTRIES[1:] if name not in arrays]
     if missing:
         raise ValueError(f"it lacks {missing[0]!r}")
     dt = _step(arrays["trajectory.dt"])
@@ -148,14 +140,14 @@ def _check_array(
 def _check_settings(settings: Any, dt: float) -> None:
     """Raise ValueError unless these are settings as `Recording` has them."""
     if not isinstance(settings, dict):
-        raise ValueError(f"settings must be a table, got {settings!r:.80}")
+        raise ValueError(f"settings must be a table, got {quoted(settings)}")
     _check_plain("settings", settings, _LEVELS)
     sides, robot = settings.get("sides", []), settings.get("robot")
     named = isinstance(sides, list) and all(isinstance(side, str) for side in sides)
     if not named or not 0 < len(sides) == len(set(sides)):
-        raise ValueError(f"settings.sides must name the hands, got {sides!r:.80}")
+        raise ValueError(f"settings.sides must name the hands, got {quoted(sides)}")
     if not isinstance(robot, str):
-        raise ValueError(f"settings.robot must be a name, got {robot!r:.80}")
+        raise ValueError(f"settings.robot must be a name, got {quoted(robot)}")
     require_range("settings.gait_period_s", settings.get("gait_period_s", math.nan), max(dt, 0.1), 10.0)
 
 
