@@ -203,6 +203,38 @@ def test_a_checkpoint_without_its_environment_is_refused_by_name(trained: Traine
         use(trained.folder / "env.pt")
 
 
+def goes_on(path: Path) -> None:
+    """As `--resume` does."""
+    train.train_base(
+        train._parse_base(["--resume", str(path), "--iterations", "2", "--run-dir", str(path.parent / "on")])
+    )
+
+
+def is_guided(path: Path) -> None:
+    """As a distillation's `--base-checkpoint` does."""
+    train.train_distill(train._parse_distill(["--base-checkpoint", str(path), "--run-dir", str(path.parent / "on")]))
+
+
+@pytest.mark.parametrize("use", [evaluates, plays, exports, goes_on, is_guided])
+@pytest.mark.parametrize("value", [math.nan, -math.inf])
+@pytest.mark.parametrize("part", ["actors", "critics", "normalizers", "moments"])
+def test_weights_that_are_not_finite_are_refused_by_name(trained: Trained, use: Any, value: float, part: str):
+    """Whoever loads them, and whether it needs them or not."""
+    content = copy.deepcopy(trained.content)
+    if part == "moments":
+        weights, name = content["learner"]["optimizers"]["lower"]["state"][0], "exp_avg"
+    else:
+        weights = content["model"]
+        name = next(n for n, v in weights.items() if n.startswith(part) and v.is_floating_point() and v.dim())
+    weights[name].view(-1)[0] = value
+    path = trained.folder / "nan.pt"
+    save_checkpoint(path, content)
+    with pytest.raises(CheckpointError, match=rf"nan\.pt' has weights that are not finite: .*{name}$"):
+        use(path)
+    assert not (trained.folder / "on").exists()
+    assert not path.with_suffix(".onnx").exists()
+
+
 @pytest.mark.parametrize("use", [evaluates, plays, exports])
 @pytest.mark.parametrize(
     ("part", "value", "message"),

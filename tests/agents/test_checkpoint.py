@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import errno
 import json
 import os
@@ -70,10 +71,10 @@ def test_files_are_readable_by_whom_the_umask_allows(tmp_path: Path, mask: int):
 
 
 def test_a_file_that_the_system_does_not_read_is_called_that(good: Path, monkeypatch: pytest.MonkeyPatch):
-    def fail(_path: Path) -> bytes:
+    def fail(_path: Path, _mode: str) -> bytes:
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 
-    monkeypatch.setattr(Path, "read_bytes", fail)
+    monkeypatch.setattr(Path, "open", fail)
     with pytest.raises(CheckpointError, match=r"cannot be opened or read from disk: .*Input/output error") as error:
         load_checkpoint(good)
     assert "truncated" not in str(error.value)
@@ -94,8 +95,45 @@ def test_an_archive_that_unpacks_to_more_than_itself_is_refused(good: Path):
     with zipfile.ZipFile(good, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, data in entries.items():
             archive.writestr(name, data)
-    with pytest.raises(CheckpointError, match="unpacks to more"):
+    with pytest.raises(CheckpointError, match="unpack to more"):
         load_checkpoint(good)
+
+
+def test_archives_whose_entries_share_their_bytes_are_refused(good: Path):
+    """Each of them fits into the file; all together are many times as large."""
+    with zipfile.ZipFile(good, "a") as archive:
+        largest = max(archive.infolist(), key=lambda entry: entry.file_size)
+        for i in range(5):
+            entry = copy.copy(largest)
+            entry.filename = f"{entry.filename}{i}"
+            archive.filelist.append(entry)
+        archive._didModify = True  # pyright: ignore[reportAttributeAccessIssue]  the list of entries is written again
+    with pytest.raises(CheckpointError, match="unpack to more"):
+        load_checkpoint(good)
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        torch.zeros(1).expand(10**12),
+        torch.zeros(3).to_sparse(),
+        torch.zeros(3, device="meta").expand(10**12, 3),
+    ],
+    ids=["expanded", "sparse", "meta"],
+)
+def test_tensors_that_claim_more_than_they_hold_are_refused(tmp_path: Path, value: torch.Tensor):
+    save_checkpoint(tmp_path / "a.pt", {"model": {"layers": [value]}})
+    with pytest.raises(CheckpointError, match=r"a\.pt' has no plain tensor of \(.*\): model\.layers\.0"):
+        load_checkpoint(tmp_path / "a.pt")
+
+
+def test_lists_that_lie_in_each_other_without_end_are_gone_through_once(tmp_path: Path):
+    deep: list[Any] = [torch.full((1,), float("nan"))]
+    for _ in range(100):  # as a tree, 2^100 places
+        deep = [deep, deep]
+    save_checkpoint(tmp_path / "a.pt", {"model": deep})
+    with pytest.raises(CheckpointError, match=r"has weights that are not finite: model\.\d"):
+        load_checkpoint(tmp_path / "a.pt")
 
 
 @pytest.mark.parametrize("name", ["missing.pt", "missing/checkpoint.pt", "."])
@@ -208,7 +246,7 @@ def test_layout_that_differs_is_named_with_both_values():
 def test_tables_of_a_layout_agree_in_what_the_environment_names():
     present = {"actions": {"scale": 0.25, "clip": 20.0}}
     require_layout("c.pt", {"actions": {"scale": 0.25, "clip": 20.0, "lead": 0.03}}, present)
-    with pytest.raises(CheckpointError, match=r"another actions: \{'scale': 0.5, 'clip': 20.0, 'lead': 0.03\}, here"):
+    with pytest.raises(CheckpointError, match=r"another actions: \{'clip': 20.0, 'lead': 0.03, 'scale': 0.5\}, here"):
         require_layout("c.pt", {"actions": {"scale": 0.5, "clip": 20.0, "lead": 0.03}}, present)
     with pytest.raises(CheckpointError, match=r"another actions: \{'scale': 0.25\}, here"):
         require_layout("c.pt", {"actions": {"scale": 0.25}}, present)

@@ -6,7 +6,9 @@ import contextlib
 import hashlib
 import io
 import json
-import reprlib
+import pickle
+import re
+import warnings
 import zipfile
 from collections.abc import Collection
 from pathlib import Path
@@ -14,8 +16,9 @@ from typing import Any
 
 import torch
 
-from cotap.checks import reason_of
+from cotap.checks import legible, quoted, reason_of
 from cotap.files import write_atomically
+from cotap.inputs import InputError, read_bytes
 
 FORMAT = "cotap-checkpoint"
 VERSION = 1
@@ -28,6 +31,9 @@ OPTIONAL_PARTS = {"device_rng"}
 """What some checkpoints lack: random numbers of a GPU, if networks were on none."""
 MALFORMED = (RuntimeError, ValueError, TypeError, LookupError, AttributeError, OverflowError)
 """What code that takes over a state raises where the state is not what it should be."""
+
+_LARGEST = 16 << 30
+"""Bytes of a file that are read."""
 
 
 class CheckpointError(ValueError):
@@ -70,36 +76,72 @@ def load_checkpoint(path: Path | str, device: str = "cpu") -> dict[str, Any]:
     """Load a checkpoint without running any code from the file.
 
     Raises:
-        CheckpointError: the file is missing, truncated, foreign, or of another version.
+        CheckpointError: the file is missing, truncated, foreign, or of another version, or has weights that are not
+            finite.
     """
     path = Path(path)
     try:
-        if not path.is_file():
-            raise CheckpointError(f"checkpoint {str(path)!r} {'is no file' if path.exists() else 'does not exist'}")
-        data = path.read_bytes()
-    except (OSError, ValueError) as error:
-        if isinstance(error, CheckpointError):
-            raise
-        raise CheckpointError(f"checkpoint {str(path)!r} cannot be opened or read from disk: {error}") from error
+        data = read_bytes(path, _LARGEST)
+    except InputError as error:
+        raise CheckpointError(f"checkpoint {str(path)!r} {error}") from error
     try:
         _refuse_compressed(data)
-        content = torch.load(io.BytesIO(data), map_location=device, weights_only=True)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # torch tells of pickles that it may not know
+            content = torch.load(io.BytesIO(data), map_location=device, weights_only=True)
     except Exception as error:  # on rubbish, torch's restricted unpickler raises whatever its reading stumbles over
-        reason = reason_of(error)
+        reason = _reason(error)
         raise CheckpointError(f"checkpoint {str(path)!r} cannot be read (truncated or foreign): {reason}") from error
     if not isinstance(content, dict) or not same(content.get("format"), FORMAT):
         raise CheckpointError(f"{str(path)!r} is not a cotap checkpoint")
     if not same(content.get("version"), VERSION):
-        raise CheckpointError(f"{str(path)!r} has version {content.get('version')!r}; this cotap reads {VERSION}")
+        raise CheckpointError(f"{str(path)!r} has version {quoted(content.get('version'))}; this cotap reads {VERSION}")
+    _require_finite(path, content)
     return content
+
+
+def _require_finite(path: Path, content: dict[str, Any]) -> None:
+    """Raise CheckpointError naming a tensor of the networks or their optimisers that claims more numbers than it holds,
+    or has one that is not finite."""
+    left: list[tuple[str, Any]] = [(part, content.get(part)) for part in ("model", "learner")]
+    seen: set[int] = set()  # a list may lie in itself, or in many places
+    while left:
+        where, value = left.pop()
+        if isinstance(value, torch.Tensor):
+            _require_finite_tensor(f"checkpoint {str(path)!r} has", where, value)
+        elif isinstance(value, (dict, list, tuple)) and id(value) not in seen:
+            seen.add(id(value))
+            items = value.items() if isinstance(value, dict) else enumerate(value)
+            left += [(f"{where}.{legible(str(key))}", inner) for key, inner in items]
+
+
+def _require_finite_tensor(who: str, where: str, value: torch.Tensor) -> None:
+    try:
+        held = value.untyped_storage().nbytes()
+    except MALFORMED:  # sparse, and others that nobody trains
+        held = -1
+    if value.numel() * value.element_size() > held:
+        raise CheckpointError(f"{who} no plain tensor of {tuple(value.shape)}: {where}")
+    if value.is_floating_point() and not value.isfinite().all():
+        raise CheckpointError(f"{who} weights that are not finite: {where}")
+
+
+def _reason(error: Exception) -> str:
+    """What is wrong with a file, in place of torch's advice to load it anyway."""
+    asked = re.search(r"GLOBAL (\S+)", str(error))
+    if asked:
+        return f"it asks for {legible(asked[1])}, which no checkpoint needs; nothing was run"
+    if isinstance(error, pickle.UnpicklingError) or "weights_only" in str(error):
+        return "it is no archive of plain tensors and numbers, and nothing else is read"
+    return legible(reason_of(error))
 
 
 def _refuse_compressed(data: bytes) -> None:
     """Torch writes archives uncompressed; one that is compressed could unpack to more than any memory holds."""
     if zipfile.is_zipfile(io.BytesIO(data)):
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            if any(entry.file_size > len(data) for entry in archive.infolist()):
-                raise ValueError("an entry unpacks to more than the whole file holds")
+            if sum(entry.file_size for entry in archive.infolist()) > len(data):
+                raise ValueError("its entries unpack to more than the whole file holds")
 
 
 def require_parts(path: Path | str, content: dict[str, Any], parts: Collection[str]) -> None:
@@ -111,7 +153,7 @@ def require_parts(path: Path | str, content: dict[str, Any], parts: Collection[s
             raise CheckpointError(f"checkpoint {str(path)!r} lacks its part {part!r}")
         value = content[part]
         if not isinstance(value, PARTS[part]) or (isinstance(value, (int, float)) and not value >= 0):
-            raise CheckpointError(f"checkpoint {str(path)!r} has no usable part {part!r}: {reprlib.repr(value)}")
+            raise CheckpointError(f"checkpoint {str(path)!r} has no usable part {part!r}: {quoted(value)}")
 
 
 def require_layout(path: Path | str, saved: dict[str, Any], present: dict[str, Any]) -> None:
@@ -125,7 +167,7 @@ def require_layout(path: Path | str, saved: dict[str, Any], present: dict[str, A
             kept = {name: entry for name, entry in kept.items() if name in value}
         if not same(kept, value):
             raise CheckpointError(
-                f"checkpoint {str(path)!r} was trained with another {key}: {saved.get(key)!r}, here {value!r}"
+                f"checkpoint {str(path)!r} was trained with another {key}: {quoted(saved.get(key))}, here {value!r}"
             )
 
 
