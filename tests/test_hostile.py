@@ -494,6 +494,51 @@ def test_a_scenario_with_changed_bytes_is_used_or_refused(
     deploys(["--policy", str(good_files / "good.onnx"), "--scenario", str(path)], "changed.toml|clip", capsys)
 
 
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+@pytest.mark.parametrize("raw", [True, False])
+def test_an_onnx_file_with_weights_that_are_not_finite_is_refused_by_name(
+    good_files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], value: float, raw: bool
+):
+    """In every weight that it has, however it is written."""
+    proto = onnx.load(good_files / "good.onnx")
+    for i, weight in enumerate(proto.graph.initializer):
+        numbers = onnx.numpy_helper.to_array(weight)
+        if numbers.dtype.kind != "f":
+            continue
+        changed = onnx.ModelProto.FromString(proto.SerializeToString())
+        numbers = numbers.copy()
+        numbers.reshape(-1)[-1] = value
+        made = onnx.numpy_helper.from_array(numbers, weight.name)
+        if not raw:
+            made = onnx.helper.make_tensor(weight.name, weight.data_type, weight.dims, numbers.reshape(-1).tolist())
+        changed.graph.initializer[i].CopyFrom(made)
+        onnx.save(changed, tmp_path / "bad.onnx")
+        assert deploy.main(["--policy", str(tmp_path / "bad.onnx")]) == 2
+        said = capsys.readouterr().err
+        assert "bad.onnx' cannot be read as ONNX: its weight " in said
+        assert said.endswith("is not finite\n")
+
+
+@pytest.mark.parametrize("key", [b"\x0a\x08location", b"\x0a\x88\x00location"])
+@pytest.mark.usefixtures("in_tmp_path")
+def test_weights_in_another_file_are_not_read(good_files: Path, capsys: pytest.CaptureFixture[str], key: bytes):
+    """Beside the policy or where the command runs; the length of a key may be written in more than one way."""
+    proto = onnx.load(good_files / "good.onnx")
+    onnx.save(proto, "outside.onnx", save_as_external_data=True, location="weights.bin", size_threshold=0)
+    assert Path("weights.bin").exists()
+    data = Path("outside.onnx").read_bytes()
+    if key != b"\x0a\x08location":
+        tensor = onnx.TensorProto(name="w", data_type=1, dims=[1], data_location=1).SerializeToString()
+        entry = key + b"\x12\x0bweights.bin"
+        tensor += b"\x6a" + bytes([len(entry)]) + entry
+        graph = b"\x2a" + bytes([len(tensor)]) + tensor
+        data = (good_files / "good.onnx").read_bytes() + b"\x3a" + bytes([len(graph)]) + graph
+        assert onnx.ModelProto.FromString(data).graph.initializer[-1].external_data[0].key == "location"
+    Path("outside.onnx").write_bytes(data)
+    assert deploy.main(["--policy", "outside.onnx"]) == 2
+    assert "'outside.onnx' cannot be read as ONNX: its weights lie in another file" in capsys.readouterr().err
+
+
 def as_toml(value: Any) -> str:
     """A value of plain data in TOML; what TOML lacks as text."""
     if isinstance(value, dict):

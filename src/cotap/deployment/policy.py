@@ -13,8 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from cotap.checks import reason_of
+from cotap.checks import reason_of, shortened
 from cotap.deployment.metadata import INPUT, TARGETS, PolicyError, PolicyMetadata, read_metadata
+from cotap.deployment.onnx_file import require_plain_weights
+from cotap.inputs import InputError, read_bytes
+
+_LARGEST = 2 << 30
+"""Bytes that an ONNX file can have."""
 
 
 class OnnxPolicy:
@@ -24,7 +29,8 @@ class OnnxPolicy:
         path: What `python -m cotap.export` wrote.
 
     Raises:
-        PolicyError: the file is missing, is not ONNX, lacks metadata, or is another network than that describes.
+        PolicyError: the file is missing, is not ONNX, has weights in another file or not finite, lacks metadata, or is
+            another network than that describes.
         ModuleNotFoundError: onnxruntime is not installed.
     """
 
@@ -34,17 +40,21 @@ class OnnxPolicy:
         import onnxruntime
 
         where = f"policy {str(path)!r}"
-        if not Path(path).is_file():
-            raise PolicyError(f"{where} does not exist")
+        try:
+            data = read_bytes(path, _LARGEST)
+        except InputError as error:
+            raise PolicyError(f"{where} {error}") from error
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.log_severity_level = 4  # what goes wrong is raised; it need not be printed as well
+        options.add_session_config_entry("session.load_model_format", "ONNX")  # not onnxruntime's own
         try:
-            self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+            require_plain_weights(data)
+            self._session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
             properties = self._session.get_modelmeta().custom_metadata_map
             inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
         except Exception as error:  # onnxruntime's errors share no base but this
-            raise PolicyError(f"{where} cannot be read as ONNX: {reason_of(error)}") from error
+            raise PolicyError(f"{where} cannot be read as ONNX: {shortened(reason_of(error))}") from error
         self.metadata = read_metadata(where, properties)
         joints, width = len(self.metadata.joints), self.metadata.observation_width
         self._require(where, "inputs", inputs, {INPUT: [1, width]})
@@ -101,7 +111,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         median, late = inference_ms(OnnxPolicy(args[0]))
     except (PolicyError, ModuleNotFoundError) as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {shortened(str(error))}", file=sys.stderr)
         return 2
     print(f"{args[0]}: inference {median:.3f} ms, 99 % within {late:.3f} ms, one thread")
     return 0
