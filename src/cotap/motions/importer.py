@@ -114,14 +114,16 @@ def _renamed(clip: MotionClip, taken: set[str]) -> MotionClip:
 def table(result: ImportResult) -> str:
     """The clips that were read, their quality, and the failures, as Markdown."""
     rows = [
-        "| clip | s | clipped | slowed | peak rad/s | hand path m | direction deg | elbow corr. | near singular |",
-        "|---|---|---|---|---|---|---|---|---|",
+        "| clip | s | clipped | slowed | peak rad/s | hand path m | direction deg | elbow corr. | near singular "
+        "| root m/s | turn rad/s |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for name, q in zip(result.read, result.quality, strict=True):
         rows.append(
             f"| {name} | {q.seconds:.1f} | {q.clipped_fraction:.1%} | {q.slowed_fraction:.1%} | "
             f"{q.peak_speed_rad_s:.1f} | {q.hand_path_error_m:.3f} | {_or_dash(q.hand_direction_error_deg, '.1f')} | "
-            f"{_or_dash(q.elbow_correlation, '.3f')} | {q.singular_fraction:.1%} |"
+            f"{_or_dash(q.elbow_correlation, '.3f')} | {q.singular_fraction:.1%} "
+            f"| {q.root_speed_m_s:.2f} | {q.root_turn_rad_s:.1f} |"
         )
     minutes = sum(c.seconds for c in result.clips) / 60.0
     out = [*rows, "", f"{len(result.clips)} clips ({len(result.read)} read), {minutes:.1f} minutes"]

@@ -16,6 +16,8 @@ from cotap.robots.chains import arm_chains
 
 SINGULAR = 10.0
 """Condition number of a hand's Jacobian beyond which an arm counts as near a singularity."""
+_STILL_RAD = 1e-3
+"""Standard deviation of an elbow that does not move: what is left is noise."""
 
 
 @dataclass(frozen=True)
@@ -31,8 +33,24 @@ class ClipQuality:
     hand_direction_error_deg: float
     """Mean angle between the directions from shoulder to hand; NaN where the source stores joints."""
     elbow_correlation: float
-    """Smallest correlation over both arms of elbow flexion with the source's; NaN where the source stores joints."""
+    """Smallest correlation over both arms of elbow flexion with the source's; NaN where the source stores joints, and
+    where no elbow moves."""
     singular_fraction: float
+    root_speed_m_s: float
+    """Peak of the root's horizontal speed."""
+    root_turn_rad_s: float
+    """Peak of its turn rate."""
+
+
+def peak_speed(clip: MotionClip) -> float:
+    """Speed of the arms' fastest joint [rad/s]."""
+    return float(np.abs(np.diff(clip.arms, axis=0)).max()) * FPS
+
+
+def root_peaks(clip: MotionClip) -> tuple[float, float]:
+    """Peaks of the root's horizontal speed [m/s] and turn rate [rad/s]."""
+    rate = np.diff(clip.root.astype(float), axis=0) * FPS
+    return float(np.linalg.norm(rate[:, :2], axis=1).max()), float(np.abs(rate[:, 2]).max())
 
 
 def forward_kinematics(spec: RobotSpec, arms: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -53,21 +71,21 @@ def assess(spec: RobotSpec, motion: JointMotion, clip: MotionClip, report: ClipR
     """Compare a finished clip with what it was made from."""
     shoulder, elbow, hand, jacobian = forward_kinematics(spec, clip.arms)
     condition = np.linalg.cond(jacobian)
-    speed = np.abs(np.diff(clip.arms, axis=0)).max() * FPS
     if motion.human is None:
         wanted = forward_kinematics(spec, resample(motion.times_s, motion.arms))[2]
         path, direction, correlation = float(np.linalg.norm(hand - wanted, axis=2).mean()), np.nan, np.nan
     else:
-        path, direction, correlation = _against_human(spec, motion, shoulder, elbow, hand)
+        path, direction, correlation = _against_human(spec, motion, shoulder, elbow, hand, jacobian)
     return ClipQuality(
-        clip.seconds, report.clipped_fraction, report.slowed_fraction, float(speed), path, direction, correlation,
-        float((condition > SINGULAR).any(1).mean()),
+        clip.seconds, report.clipped_fraction, report.slowed_fraction, peak_speed(clip), path, direction, correlation,
+        float((condition > SINGULAR).any(1).mean()), *root_peaks(clip),
     )  # fmt: skip
 
 
 def _against_human(
-    spec: RobotSpec, motion: JointMotion, shoulder: np.ndarray, elbow: np.ndarray, hand: np.ndarray
-) -> tuple[float, float, float]:
+    spec: RobotSpec, motion: JointMotion, shoulder: np.ndarray, elbow: np.ndarray, hand: np.ndarray,
+    jacobian: np.ndarray,
+) -> tuple[float, float, float]:  # fmt: skip
     human = motion.human
     assert human is not None
     paths, angles, correlations = [], [], []
@@ -86,9 +104,8 @@ def _against_human(
         upper_length = np.linalg.norm(upper, axis=1).mean()
         human_length = upper_length * np.sqrt(1.0 + ratio**2 + 2.0 * ratio * np.cos(flexion))
         paths.append(np.linalg.norm(reach - reference * human_length[:, None], axis=1).mean())
-        bend = np.arccos(
-            np.clip((upper * fore).sum(1) / np.linalg.norm(upper, axis=1) / np.linalg.norm(fore, axis=1), -1.0, 1.0)
-        )
-        still = flexion.std() < 1e-6 or bend.std() < 1e-6
-        correlations.append(np.nan if still else np.corrcoef(bend, flexion)[0, 1])
-    return float(np.mean(paths)), float(np.mean(angles)), float(np.min(correlations))
+        # How the hand moves with the elbow's joint tells to which side of straight the forearm is.
+        bend = np.arctan2((upper * jacobian[:, i, :, elbow_index(spec, arm)]).sum(1), (upper * fore).sum(1))
+        if min(flexion.std(), bend.std()) > _STILL_RAD:
+            correlations.append(np.corrcoef(bend, flexion)[0, 1])
+    return float(np.mean(paths)), float(np.mean(angles)), float(min(correlations, default=np.nan))
