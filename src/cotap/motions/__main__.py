@@ -6,6 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from cotap.checks import shortened
 from cotap.files import require_output
 from cotap.motions.formats import FORMATS
 from cotap.motions.importer import import_motions, table
@@ -27,6 +28,7 @@ def _parser() -> argparse.ArgumentParser:
         help="the library to write (.npz); one of that name is replaced",
     )
     importer.add_argument("--mirror", action="store_true", help="add the left-right mirror image of every clip")
+    importer.add_argument("--fps", type=float, metavar="HZ", help="frame rate of the files, in place of what they say")
     importer.add_argument("--source", default="not stated", help="where the motion comes from, kept in the file")
     importer.add_argument("--licence", default="not stated", help="its terms, kept in the file")
     shower = commands.add_parser("show", help="list a library's clips and plot them")
@@ -45,8 +47,9 @@ def _import(options: argparse.Namespace) -> int:
     require_output("--output", options.output)
     spec = ROBOTS[options.robot]()
     result = import_motions(
-        options.sources, spec, options.format, options.mirror, options.source, options.licence, sys.stderr.isatty()
-    )
+        options.sources, spec, options.format, options.mirror, options.source, options.licence, sys.stderr.isatty(),
+        options.fps,
+    )  # fmt: skip
     print(table(result))
     if not result.clips:
         raise MotionError("no clip could be used; nothing was written")
@@ -73,7 +76,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         return {"import": _import, "show": _show}[options.command](options)
     except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {shortened(str(error))}", file=sys.stderr)
         return 2
 
 

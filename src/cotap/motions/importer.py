@@ -9,11 +9,15 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from cotap.motions.formats import FORMATS, SUFFIXES, detect_format
+from cotap.checks import legible
+from cotap.motions.formats import FASTEST_FPS, FORMATS, SLOWEST_FPS, SUFFIXES, detect_format
 from cotap.motions.library import MotionClip, MotionError
 from cotap.motions.processing import JointMotion, make_clip, mirror_clip
 from cotap.motions.quality import ClipQuality, assess
 from cotap.robots import RobotSpec
+
+_LONGEST_LABEL = 5000
+"""Characters of a file's path and a clip's name."""
 
 
 @dataclass(frozen=True)
@@ -34,8 +38,8 @@ def find_files(sources: Iterable[Path]) -> list[Path]:
     found: list[Path] = []
     for source in sources:
         if source.is_dir():
-            found += sorted(p for p in source.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
-        elif source.is_file():
+            found += sorted(p for p in source.rglob("*") if p.suffix.lower() in SUFFIXES and not p.is_dir())
+        elif source.exists():
             found.append(source)
         else:
             raise MotionError(f"motion source {str(source)!r} does not exist")
@@ -46,7 +50,7 @@ def find_files(sources: Iterable[Path]) -> list[Path]:
 
 def import_motions(
     sources: Iterable[Path], spec: RobotSpec, file_format: str = "auto", mirror: bool = False,
-    source: str = "not stated", licence: str = "not stated", progress: bool = True,
+    source: str = "not stated", licence: str = "not stated", progress: bool = True, fps: float | None = None,
 ) -> ImportResult:  # fmt: skip
     """Read, retarget and limit every clip of `sources`.
 
@@ -58,21 +62,24 @@ def import_motions(
         source: Where the motion comes from, kept with each clip.
         licence: Its terms, kept with each clip.
         progress: Show a progress bar.
+        fps: Frame rate [Hz] in place of what the files say.
 
     Raises:
-        MotionError: a source is missing, or there are no files.
+        MotionError: a source is missing, there are no files, or no clip can have that rate.
     """
+    if fps is not None and not SLOWEST_FPS <= fps <= FASTEST_FPS:
+        raise MotionError(f"--fps must be in [{SLOWEST_FPS:g}, {FASTEST_FPS:g}] Hz, got {fps}")
     result = ImportResult([], [], [], [])
     taken: set[str] = set()
     for path in tqdm(find_files(sources), desc="import", unit="file", disable=None if progress else True, leave=False):
-        for label, outcome in _read_file(path, spec, file_format):
+        for label, outcome in _read_file(path, spec, file_format, fps):
             if isinstance(outcome, str):
                 result.failures.append((label, outcome))
                 continue
             try:
                 clip, report = make_clip(spec, outcome, source, licence)
                 quality = assess(spec, outcome, clip, report)
-            except (MotionError, ValueError, np.linalg.LinAlgError) as error:
+            except (ValueError, MemoryError, np.linalg.LinAlgError) as error:
                 result.failures.append((label, str(error)))
                 continue
             clip = _renamed(clip, taken)
@@ -84,19 +91,21 @@ def import_motions(
     return result
 
 
-def _read_file(path: Path, spec: RobotSpec, file_format: str) -> Iterator[tuple[str, JointMotion | str]]:
+def _read_file(
+    path: Path, spec: RobotSpec, file_format: str, fps: float | None
+) -> Iterator[tuple[str, JointMotion | str]]:
     """Every clip of a file, or in its place why it cannot be read."""
     try:
         reader = FORMATS[detect_format(path) if file_format == "auto" else file_format]
-        clips = reader(path, spec)
-    except (MotionError, OSError) as error:
+        clips = reader(path, spec, fps)
+    except (ValueError, OSError, MemoryError) as error:
         yield str(path), str(error)
         return
     for name, read in clips:
-        label = str(path) if len(clips) == 1 else f"{path}:{name}"
+        label = str(path) if len(clips) == 1 else f"{path}:{legible(name)}"
         try:
             yield label, read()
-        except (MotionError, OSError, ValueError) as error:
+        except (ValueError, OSError, MemoryError) as error:
             yield label, str(error)
 
 
@@ -129,7 +138,7 @@ def table(result: ImportResult) -> str:
     out = [*rows, "", f"{len(result.clips)} clips ({len(result.read)} read), {minutes:.1f} minutes"]
     if result.failures:
         out += ["", f"{len(result.failures)} could not be used:"]
-        out += [f"- {label}: {reason}" for label, reason in result.failures]
+        out += [f"- {legible(label, _LONGEST_LABEL)}: {reason}" for label, reason in result.failures]
     return "\n".join(out)
 
 

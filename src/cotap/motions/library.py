@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Collection
 from dataclasses import dataclass
 from importlib.resources import as_file, files
 from pathlib import Path
 
 import numpy as np
 
-from cotap.checks import reason_of
+from cotap.checks import legible, quoted
 from cotap.files import write_arrays
+from cotap.inputs import InputError, read_arrays
 from cotap.robots import RobotSpec
 
 FPS = 50.0
@@ -22,6 +24,11 @@ ENTRIES = {
     "root": ("f", 2),
 }  # fmt: skip
 """What is in a library's file: numpy's kinds of dtype, and the number of dimensions."""
+LARGEST_ROOT = 1e4
+"""How far a root may go [m], and how far it may turn [rad], either way."""
+_LARGEST_FILE = 1 << 30
+"""Bytes of arrays that are read: a hundred hours of motion."""
+_LONGEST_NAME = 200
 
 
 class MotionError(ValueError):
@@ -51,7 +58,11 @@ class MotionClip:
 
 
 def check_clip(clip: MotionClip, spec: RobotSpec) -> None:
-    """Raise MotionError if `clip` has wrong shapes, too few frames, values that are not finite or beyond limits."""
+    """Raise MotionError if `clip` has no usable name, wrong shapes or too few frames, or values beyond limits."""
+    if len(clip.name) > _LONGEST_NAME or not clip.name.isprintable():
+        raise MotionError(
+            f"clip {quoted(clip.name)} must have a name of at most {_LONGEST_NAME} characters, all of them printable"
+        )
     upper = [spec.joints[i] for i in spec.indices(spec.upper_joints)]
     if clip.arms.ndim != 2 or clip.arms.shape[1] != len(upper):
         raise MotionError(f"clip {clip.name!r}: arms must have shape (T, {len(upper)}), got {clip.arms.shape}")
@@ -61,6 +72,7 @@ def check_clip(clip: MotionClip, spec: RobotSpec) -> None:
         raise MotionError(f"clip {clip.name!r} has {len(clip.arms)} frames; at least 2 are needed")
     if not (np.isfinite(clip.arms).all() and np.isfinite(clip.root).all()):
         raise MotionError(f"clip {clip.name!r} has values that are not finite")
+    check_root(clip.name, clip.root)
     low, high = np.array([j.range_rad for j in upper], dtype=np.float32).T
     excess = np.maximum(low - clip.arms, clip.arms - high)
     if excess.max() > 1e-5:
@@ -68,6 +80,17 @@ def check_clip(clip: MotionClip, spec: RobotSpec) -> None:
         raise MotionError(
             f"clip {clip.name!r}: {upper[joint].name} is {clip.arms[frame, joint]:.3f} rad at frame {frame}; "
             f"its limits are {upper[joint].range_rad}"
+        )
+
+
+def check_root(name: str, root: np.ndarray) -> None:
+    """Raise MotionError if a root (T, 3) of x, y [m] and heading [rad] is farther than any clip leads."""
+    beyond = np.abs(root) > LARGEST_ROOT
+    if beyond.any():
+        frame, column = np.argwhere(beyond)[0]
+        raise MotionError(
+            f"clip {quoted(name)}: the root's {('x', 'y', 'heading')[column]} is {root[frame, column]:g} "
+            f"at frame {frame}; it must lie in [-{LARGEST_ROOT:g}, {LARGEST_ROOT:g}] {'rad' if column == 2 else 'm'}"
         )
 
 
@@ -87,7 +110,7 @@ class MotionLibrary:
         seen: set[str] = set()
         for name in names:
             if name in seen:
-                raise MotionError(f"two clips are called {name!r}")
+                raise MotionError(f"two clips are called {quoted(name)}")
             seen.add(name)
         self.clips, self.robot, self.joints = clips, spec.name, spec.upper_joints
 
@@ -100,7 +123,7 @@ class MotionLibrary:
         known = {c.name: c for c in self.clips}
         for name in names:
             if name not in known:
-                raise MotionError(f"no clip is called {name!r}; clips: {', '.join(sorted(known))}")
+                raise MotionError(f"no clip is called {quoted(name)}; clips: {legible(', '.join(sorted(known)), 2000)}")
         return MotionLibrary([known[n] for n in names], spec)
 
     def save(self, path: str | Path) -> None:
@@ -127,7 +150,7 @@ class MotionLibrary:
         Raises:
             MotionError: the file is missing, damaged, of another kind or for another robot.
         """
-        content = read_npz(path)
+        content = read_npz(path, ENTRIES)
         missing = ENTRIES.keys() - content.keys()
         if missing:
             raise MotionError(f"{str(path)!r} is no motion library: it lacks {sorted(missing)[0]!r}")
@@ -139,8 +162,8 @@ class MotionLibrary:
                 )
         if tuple(content["joints"].tolist()) != spec.upper_joints or str(content["robot"]) != spec.name:
             raise MotionError(
-                f"{str(path)!r} is for the arms of {str(content['robot'])!r} "
-                f"({', '.join(content['joints'].tolist())}), not of {spec.name!r} ({', '.join(spec.upper_joints)})"
+                f"{str(path)!r} is for the arms of {quoted(str(content['robot']))} "
+                f"({quoted(content['joints'].tolist())}), not of {spec.name!r} ({', '.join(spec.upper_joints)})"
             )
         if content["fps"] != FPS or content["version"] != _VERSION:
             raise MotionError(
@@ -165,21 +188,12 @@ class MotionLibrary:
         return cls(clips, spec)
 
 
-def read_npz(path: str | Path) -> dict[str, np.ndarray]:
-    """All arrays of an npz file, none of them objects. Raises MotionError for anything else."""
+def read_npz(path: str | Path, names: Collection[str]) -> dict[str, np.ndarray]:
+    """The arrays of an npz file that are called one of `names`. Raises MotionError as `read_arrays` does."""
     try:
-        with np.load(path, allow_pickle=False) as file:
-            if not isinstance(file, np.lib.npyio.NpzFile):
-                raise MotionError(f"{str(path)!r} is not an npz file")
-            return {key: file[key] for key in file.files}
-    except FileNotFoundError as error:
-        raise MotionError(f"motion file {str(path)!r} does not exist") from error
-    except OSError as error:
-        raise MotionError(f"motion file {str(path)!r} cannot be read from disk: {error}") from error
-    except MotionError:
-        raise
-    except Exception as error:  # zip, zlib and numpy each fail in ways of their own on rubbish
-        raise MotionError(f"{str(path)!r} is damaged or no npz file of plain numbers: {reason_of(error)}") from error
+        return read_arrays(path, names, _LARGEST_FILE)
+    except InputError as error:
+        raise MotionError(f"motion file {str(path)!r} {error}") from error
 
 
 def _shipped_name(spec: RobotSpec) -> str:

@@ -7,10 +7,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from cotap.motions.library import FPS, MotionClip, MotionError
+from cotap.checks import quoted
+from cotap.motions.library import FPS, MotionClip, MotionError, check_clip, check_root
 from cotap.motions.refine import slow_down
 from cotap.motions.retarget import HumanMotion
 from cotap.robots import RobotSpec
+
+LONGEST_S = 3600.0
+"""How long a clip may last [s]."""
+_LARGEST_ANGLE = 1e3
+"""How far a joint may be turned in a source [rad]; limits come later."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +48,8 @@ def make_clip(spec: RobotSpec, motion: JointMotion, source: str, licence: str) -
     """Resample, keep within position and velocity limits.
 
     Raises:
-        MotionError: too few frames, values that are not finite, or times that do not grow.
+        MotionError: too few frames, times that do not grow or go on for more than `LONGEST_S`, values that are not
+            finite or beyond all that a robot does, or a clip that `check_clip` refuses.
     """
     _check(spec, motion)
     upper = [spec.joints[i] for i in spec.indices(spec.upper_joints)]
@@ -58,23 +65,41 @@ def make_clip(spec: RobotSpec, motion: JointMotion, source: str, licence: str) -
     clip = MotionClip(
         motion.name, slow.astype(np.float32), resample(motion.times_s, root).astype(np.float32), source, licence
     )
-    return replace(clip, arms=np.clip(clip.arms, low.astype(np.float32), high.astype(np.float32))), report
+    clip = replace(clip, arms=np.clip(clip.arms, low.astype(np.float32), high.astype(np.float32)))
+    check_clip(clip, spec)
+    return clip, report
+
+
+def check_times(name: str, times_s: np.ndarray) -> None:
+    """Raise MotionError unless the times (T,) of a clip's frames [s] grow, and last neither too short nor too long."""
+    if len(times_s) < 2:
+        raise MotionError(f"clip {quoted(name)} has {len(times_s)} frames; at least 2 are needed")
+    if not np.isfinite(times_s).all():
+        raise MotionError(f"clip {quoted(name)}: times are not finite at frame {int((~np.isfinite(times_s)).argmax())}")
+    if not (np.diff(times_s) > 0.0).all():
+        raise MotionError(f"clip {quoted(name)}: times do not grow")
+    seconds = times_s[-1] - times_s[0]
+    if not 1.0 / FPS <= seconds <= LONGEST_S:
+        raise MotionError(f"clip {quoted(name)} lasts {seconds:g} s; it must last {1.0 / FPS:g} to {LONGEST_S:g} s")
 
 
 def _check(spec: RobotSpec, motion: JointMotion) -> None:
+    check_times(motion.name, motion.times_s)
     frames = len(motion.times_s)
-    if frames < 2:
-        raise MotionError(f"clip {motion.name!r} has {frames} frames; at least 2 are needed")
     if motion.arms.shape != (frames, len(spec.upper_joints)) or motion.root.shape != (frames, 3):
-        raise MotionError(f"clip {motion.name!r}: arms {motion.arms.shape} and root {motion.root.shape} do not fit")
-    for what, values in (("times", motion.times_s), ("arm joints", motion.arms), ("root", motion.root)):
+        raise MotionError(
+            f"clip {quoted(motion.name)}: arms {motion.arms.shape} and root {motion.root.shape} do not fit"
+        )
+    for what, values in (("arm joints", motion.arms), ("root", motion.root)):
         if not np.isfinite(values).all():
             first = np.argwhere(~np.isfinite(values))[0][0]
-            raise MotionError(f"clip {motion.name!r}: {what} are not finite at frame {first}")
-    if not (np.diff(motion.times_s) > 0.0).all():
-        raise MotionError(f"clip {motion.name!r}: times do not grow")
-    if motion.times_s[-1] - motion.times_s[0] < 1.0 / FPS:
-        raise MotionError(f"clip {motion.name!r} lasts less than {1.0 / FPS:g} s")
+            raise MotionError(f"clip {quoted(motion.name)}: {what} are not finite at frame {first}")
+    if (largest := np.abs(motion.arms).max()) > _LARGEST_ANGLE:
+        raise MotionError(
+            f"clip {quoted(motion.name)}: an arm joint is turned by {largest:g} rad; "
+            f"at most {_LARGEST_ANGLE:g} rad are read"
+        )
+    check_root(motion.name, motion.root)
 
 
 def resample(times_s: np.ndarray, values: np.ndarray) -> np.ndarray:
