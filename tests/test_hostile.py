@@ -42,7 +42,6 @@ from cotap.evaluation.recording import (
 )
 from cotap.evaluation.rollout import Trajectory
 from cotap.motions import __main__ as motions
-from cotap.motions import show
 from cotap.motions.formats import FORMATS
 from cotap.motions.joblib_files import load_joblib
 from cotap.motions.library import MotionError, MotionLibrary, shipped_library
@@ -417,7 +416,7 @@ def test_every_command_is_obeyed_or_refused(
 
     monkeypatch.chdir(good_files)
     for module, work in (
-        (motions, "import_motions"), (show, "show"), (graph, "export_policy"), (trials, "run_trials"),
+        (motions, "import_motions"), (motions, "describe"), (graph, "export_policy"), (trials, "run_trials"),
         (compare, "table"), (server.viser, "ViserServer"),
     ):  # fmt: skip
         monkeypatch.setattr(module, work, begin)

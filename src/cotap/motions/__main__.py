@@ -9,7 +9,7 @@ from pathlib import Path
 from cotap.checks import shortened
 from cotap.files import require_output
 from cotap.motions.formats import FORMATS
-from cotap.motions.importer import import_motions, table
+from cotap.motions.importer import describe, import_motions, table
 from cotap.motions.library import MotionError, MotionLibrary, shipped_library
 from cotap.robots import ROBOTS
 
@@ -31,10 +31,12 @@ def _parser() -> argparse.ArgumentParser:
     importer.add_argument("--fps", type=float, metavar="HZ", help="frame rate of the files, in place of what they say")
     importer.add_argument("--source", default="not stated", help="where the motion comes from, kept in the file")
     importer.add_argument("--licence", default="not stated", help="its terms, kept in the file")
-    shower = commands.add_parser("show", help="list a library's clips and plot them")
+    shower = commands.add_parser("show", help="list a library's clips, and draw them if asked to")
     shower.add_argument("file", nargs="?", type=Path, metavar="FILE", help="a library; by default the shipped one")
     shower.add_argument("--clip", action="append", default=[], help="only this clip (may be repeated)")
-    shower.add_argument("--output", type=Path, default=Path("runs/motions"), metavar="DIR", help="where pictures go")
+    shower.add_argument(
+        "--output", type=Path, metavar="DIR", help="draw the clips, seconds for each, and put the pictures here"
+    )
     for command in (importer, shower):
         command.add_argument("--robot", default="h1", choices=tuple(ROBOTS))
     return parser
@@ -59,14 +61,16 @@ def _import(options: argparse.Namespace) -> int:
 
 
 def _show(options: argparse.Namespace) -> int:
-    from cotap.motions.show import show  # plotting loads slowly
-
     spec = ROBOTS[options.robot]()
     library = MotionLibrary.load(options.file, spec) if options.file else shipped_library(spec)
     if options.clip:
         library = library.select(options.clip, spec)
-    for path in show(library, spec, options.output):
-        print(f"written: {path}")
+    print(describe(library))
+    if options.output:
+        from cotap.motions.show import draw  # plotting loads slowly
+
+        for path in draw(library, spec, options.output):
+            print(f"written: {path}")
     return 0
 
 

@@ -11,9 +11,9 @@ from tqdm import tqdm
 
 from cotap.checks import legible
 from cotap.motions.formats import FASTEST_FPS, FORMATS, SLOWEST_FPS, SUFFIXES, detect_format
-from cotap.motions.library import MotionClip, MotionError
+from cotap.motions.library import MotionClip, MotionError, MotionLibrary
 from cotap.motions.processing import JointMotion, make_clip, mirror_clip
-from cotap.motions.quality import ClipQuality, assess
+from cotap.motions.quality import ClipQuality, assess, peak_speed, root_peaks
 from cotap.robots import RobotSpec
 
 _LONGEST_LABEL = 5000
@@ -140,6 +140,16 @@ def table(result: ImportResult) -> str:
         out += ["", f"{len(result.failures)} could not be used:"]
         out += [f"- {legible(label, _LONGEST_LABEL)}: {reason}" for label, reason in result.failures]
     return "\n".join(out)
+
+
+def describe(library: MotionLibrary) -> str:
+    """Every clip of a library with what its root and joints do at most, its source and licence, as Markdown."""
+    rows = ["| clip | s | peak rad/s | root m/s | turn rad/s | source | licence |", "|---|---|---|---|---|---|---|"]
+    for c in library.clips:
+        speed, turn = root_peaks(c)
+        about = " | ".join(legible(text) for text in (c.source, c.licence))
+        rows.append(f"| {c.name} | {c.seconds:.2f} | {peak_speed(c):.1f} | {speed:.2f} | {turn:.1f} | {about} |")
+    return "\n".join(rows)
 
 
 def _or_dash(value: float, form: str) -> str:

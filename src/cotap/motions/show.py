@@ -20,18 +20,11 @@ _LARGEST_SHEET = 24
 """Clips in a contact sheet; more are unreadable."""
 
 
-def describe(library: MotionLibrary) -> str:
-    """Name, duration, source and licence of every clip, as Markdown."""
-    rows = [f"| {c.name} | {c.seconds:.2f} | {c.source} | {c.licence} |" for c in library.clips]
-    return "\n".join(["| clip | s | source | licence |", "|---|---|---|---|", *rows])
-
-
-def show(library: MotionLibrary, spec: RobotSpec, folder: Path) -> Iterator[Path]:
-    """Print the list of clips, write a plot for each and a contact sheet of them; yields what was written.
+def draw(library: MotionLibrary, spec: RobotSpec, folder: Path) -> Iterator[Path]:
+    """Write a plot of each clip and a contact sheet of them; yields what was written.
 
     Where the machine cannot render, it says so and leaves the sheet out.
     """
-    print(describe(library))
     folder.mkdir(parents=True, exist_ok=True)
     for clip in library.clips:
         path = folder / f"{clip.name.replace('/', '_')}.png"
