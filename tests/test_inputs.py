@@ -170,10 +170,11 @@ def test_an_array_that_claims_what_it_is_not_is_refused_before_it_is_made(tmp_pa
 
 def test_a_file_is_read_no_further_than_it_may_be(tmp_path: Path):
     (tmp_path / "a.txt").write_text("x" * 1001)
-    with pytest.raises(InputError, match="has more than the 1000 bytes that are read"):
+    with pytest.raises(InputError, match="has 1001 bytes; at most 1000 are read"):
         read_text(tmp_path / "a.txt", 1000)
+    assert len(read_text(tmp_path / "a.txt", 1 << 60)) == 1001  # and no more memory is taken than it needs
     (tmp_path / "a.toml").write_text("#" * (2 << 20))
-    assert "has more than the 1048576 bytes that are read" in refused("a.toml", tmp_path / "a.toml")
+    assert "has 2097152 bytes; at most 1048576 are read" in refused("a.toml", tmp_path / "a.toml")
 
 
 def test_what_is_no_text_is_called_that(tmp_path: Path):

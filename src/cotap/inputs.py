@@ -46,15 +46,14 @@ def require_regular(path: Path | str) -> int:
 
 def read_bytes(path: Path | str, largest: int) -> bytes:
     """A file of at most `largest` bytes. Raises InputError for a larger one, and as `require_regular` does."""
-    require_regular(path)
+    size = require_regular(path)
+    if size > largest:
+        raise InputError(f"has {size} bytes; at most {largest} are read")
     try:
         with Path(path).open("rb") as file:
-            data = file.read(largest + 1)
+            return file.read(size)  # no more than it had: memory is taken for all that is asked for
     except OSError as error:
         raise InputError(f"cannot be opened or read from disk: {error}") from error
-    if len(data) > largest:
-        raise InputError(f"has more than the {largest} bytes that are read")
-    return data
 
 
 def read_text(path: Path | str, largest: int = LARGEST_TEXT) -> str:

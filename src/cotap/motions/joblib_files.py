@@ -175,6 +175,14 @@ def _read_array(wrapper: _ArrayWrapper, file: BinaryIO) -> np.ndarray:
     return array.reshape(wrapper.shape)
 
 
+def _read(file: BinaryIO, most: int) -> bytes:
+    """So many bytes, or all there are; memory is taken only for those."""
+    data = bytearray()
+    while len(data) < most and (part := file.read(min(most - len(data), 1 << 24))):
+        data += part
+    return bytes(data)
+
+
 def _unpacked(path: Path) -> BinaryIO:
     """The file's content, whatever it was compressed with."""
     raw = read_bytes(path, _LARGEST)
@@ -183,7 +191,7 @@ def _unpacked(path: Path) -> BinaryIO:
         (b"\x1f\x8b", gzip.open), (b"BZ", bz2.open), (b"\xfd7zXZ", lzma.open), (b"\x5d\x00", lzma.open),
     ):  # fmt: skip
         if raw.startswith(magic):
-            data = unpack(io.BytesIO(raw)).read(most + 1)
+            data = _read(unpack(io.BytesIO(raw)), most + 1)
             break
     else:
         data = zlib.decompressobj().decompress(raw, most + 1) if raw[:1] == b"\x78" else raw
