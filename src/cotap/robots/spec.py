@@ -145,7 +145,7 @@ class RobotSpec:
     @cached_property
     def sole_distance_m(self) -> float:
         """Lateral distance between the first two soles in the default pose."""
-        first, second = (self._sole(foot) for foot in self.feet[:2])
+        first, second = (self.sole(foot) for foot in self.feet[:2])
         return abs(float(first[1] - second[1]))
 
     def pitches(self, joint: str) -> bool:
@@ -158,7 +158,7 @@ class RobotSpec:
     def torso_ahead_m(self) -> float:
         """How far ahead of the middle of the soles the torso link's origin is in the default pose."""
         torso, _ = body_frame(self, self.torso_body, self.base_body, default_angles(self))
-        return float(torso[0] - sum(self._sole(foot)[0] for foot in self.feet) / len(self.feet))
+        return float(torso[0] - sum(self.sole(foot)[0] for foot in self.feet) / len(self.feet))
 
     def __post_init__(self) -> None:
         self._check_order()
@@ -197,7 +197,7 @@ class RobotSpec:
             body = self.body(body.parent)
         return tuple(reversed(out))
 
-    def _sole(self, foot: FootSpec) -> np.ndarray:
+    def sole(self, foot: FootSpec) -> np.ndarray:
         """Centre of a sole (3,) in the base's frame in the default pose [m]."""
         position, rotation = body_frame(self, foot.body, self.base_body, default_angles(self))
         return position + rotation @ foot.sole
@@ -239,5 +239,5 @@ class RobotSpec:
         ends = [body for arm in self.arms for body in (arm.hand_body, arm.elbow_body)] + [f.body for f in self.feet]
         for name in (self.base_body, self.torso_body, *ends, *(n for pair in self.contact_excludes for n in pair)):
             self.body(name)
-        if self._sole(self.feet[0])[1] <= self._sole(self.feet[1])[1]:
+        if self.sole(self.feet[0])[1] <= self.sole(self.feet[1])[1]:
             raise ValueError(f"{self.name}: the left foot must come first, got {self.feet[0].side!r}")
