@@ -137,6 +137,15 @@ def test_links_that_touch_are_named(engine, spec, gains):
     assert any("ankle" in first and "ankle" in second for first, second in touching)
 
 
+def test_pairs_that_never_collide_touch_in_no_engine(any_engine, any_spec):
+    """Shapes of the made-up robot's pelvis and hips overlap."""
+    pose = np.array([j.default_rad for j in any_spec.joints])
+    gains = [np.array([getattr(j, name) for j in any_spec.joints]) for name in ("kp", "kd")]
+    any_engine.reset(np.concatenate(([0.0, 0.0, 3.0, 1.0, 0.0, 0.0, 0.0], pose)), np.zeros(6 + len(pose)), 1.0)
+    any_engine.advance(pd_law(*gains, pose), 1, FREE)
+    assert any_engine.touching() == set()
+
+
 def test_heavier_robots_sag_more(engine, spec, gains):
     kp, kd, default = gains
     sag = []

@@ -46,6 +46,8 @@ class PybulletEngine:
         by_joint = {b.joint: links[b.name] for b in spec.bodies if b.joint}
         self._joints = [by_joint[name] for name in spec.joint_names]
         self._links = {spec.base_body: -1, **links}
+        for first, second in spec.contact_excludes:
+            bullet.setCollisionFilterPair(self._robot, self._robot, self._links[first], self._links[second], 0)
         self._set_dynamics(cfg)
         bullet.setJointMotorControlArray(
             self._robot, self._joints, pybullet.VELOCITY_CONTROL, forces=[0.0] * len(self._joints)
