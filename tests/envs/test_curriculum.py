@@ -9,12 +9,13 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from env_tools import NOMINAL, felt, hold_still, mujoco_of, zeros
+from env_tools import NOMINAL, drive, felt, hold_still, mujoco_of, zeros
 
 from cotap.compliance.kinematics import ChainPose
 from cotap.envs.commands import Command
-from cotap.envs.curriculum import AssistConfig, RampConfig, assist_wrench
+from cotap.envs.curriculum import AssistConfig, AssistWrench, RampConfig
 from cotap.envs.state import RobotState
+from cotap.robots.mjcf import torso_inertia
 
 
 @pytest.mark.parametrize(("samples", "share"), [(0, 0.2), (100, 0.2), (150, 0.4), (200, 0.6), (300, 1.0), (1e12, 1.0)])
@@ -70,6 +71,7 @@ CFG = AssistConfig(
     weight_share=0.25,
 )  # fmt: skip
 TILT = 0.2
+HEAVY = torch.full((3,), 1e3)
 
 
 def turned(axis: str, angle: float) -> torch.Tensor:
@@ -96,7 +98,7 @@ def wrench(spec, heading=0.0, tilt=None, spin_w=(0, 0, 0), off=(0, 0), yaw_rate=
         torch.tensor([[0.3, -0.1]]), spin[:, 2] + yaw_rate, torch.zeros(1), torch.tensor([0.7 + below]), torch.zeros(1)
     )
     weight = spec.mass_kg * 9.81
-    out = assist_wrench(CFG, spec, state, command)[0]
+    out = AssistWrench(CFG, spec, HEAVY, 0.02)(state, command)[0]
     return (out[:3] / weight).tolist(), (out[3:] / weight / spec.nominal_height_m).tolist()
 
 
@@ -126,18 +128,43 @@ def test_the_wrench_by_hand_in_units_of_weight(any_spec, errors, force, torque):
 
 def test_units_of_the_h1_are_its_weight(spec):
     """A quarter of 51.437 kg is lifted: 126.1 N."""
-    still = assist_wrench(*_at_rest(spec))
+    still = AssistWrench(CFG, spec, HEAVY, 0.02)(*_at_rest())
     assert float(still[0, 2]) == pytest.approx(0.25 * 51.437 * 9.81, abs=1e-2)
 
 
-def _at_rest(spec):
+def test_damping_stops_a_light_torso_within_a_step_at_most_one_and_a_half_times(spec):
+    state, command = _at_rest()
+    state = dataclasses.replace(state, torso_angular_velocity_t=torch.tensor([[0.1, -0.1, 0.0]]))
+    command = dataclasses.replace(command, yaw_rate=torch.full((1,), 0.1))
+    torque = AssistWrench(CFG, spec, torch.tensor([0.4, 0.2, 0.3]), 0.02)(state, command)[0, 3:]
+    assert torque.tolist() == pytest.approx([-0.1 * 15.0, 0.1 * 15.0, 0.1 * 22.5])
+
+
+def test_the_h1_is_damped_as_its_weight_says(spec, model):
+    state, command = _at_rest()
+    state = dataclasses.replace(state, torso_angular_velocity_t=torch.tensor([[1.0, 0.0, 0.0]]))
+    command = dataclasses.replace(command, yaw_rate=torch.ones(1))
+    torque = AssistWrench(CFG, spec, torch.from_numpy(torso_inertia(spec, model)), 0.02)(state, command)[0, 3:]
+    lever = 51.437 * 9.81 * 1.0205
+    assert torque.tolist() == pytest.approx([-0.08 * lever, 0.0, 0.06 * lever], rel=1e-4)
+
+
+def test_it_shakes_no_robot_apart(make_env, robot):
+    """In full, over a second and a half of random actions: a damper too strong for its step throws robots about."""
+    env = make_env(16, robot=robot, assist=AssistConfig(enabled=True))
+    drive(env, 75, scale=0.5)
+    assert env.num_diverged == 0
+    assert float(env.sim.qvel.abs().max()) < 60.0
+
+
+def _at_rest():
     eye, zero = torch.eye(3).unsqueeze(0), torch.zeros(1, 3)
     names = {f.name: torch.zeros(1, 1) for f in dataclasses.fields(RobotState)}
     state = RobotState(**{
         **names, "torso_rotation_w": eye, "heading_w": eye, "torso_linear_velocity_h": zero, "yaw_rate": zero[:, 0],
         "torso_angular_velocity_t": zero, "torso_pos_w": zero,
     })  # fmt: skip
-    return CFG, spec, state, Command(zero[:, :2], zero[:, 0], zero[:, 0], zero[:, 0], zero[:, 0])
+    return state, Command(zero[:, :2], zero[:, 0], zero[:, 0], zero[:, 0], zero[:, 0])
 
 
 def test_it_acts_on_the_torso_and_nowhere_else(make_env, robot):

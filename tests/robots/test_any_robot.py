@@ -13,7 +13,7 @@ from robots.made_up import made_up
 from cotap.compliance.dynamics import joint_inertia
 from cotap.robots.chains import arm_chains, arm_model
 from cotap.robots.kinematics import body_frame, default_angles
-from cotap.robots.mjcf import FIXED_BASE_LIFT_M, build_model
+from cotap.robots.mjcf import FIXED_BASE_LIFT_M, build_model, torso_inertia
 
 SWAP = {"left": "right", "right": "left"}
 
@@ -187,6 +187,20 @@ def test_limits_and_the_default_pose_are_their_own_mirror_image(any_spec):
         assert other.default_rad == pytest.approx(joint.mirror_sign * joint.default_rad)
         if joint is not other:
             assert other.range_rad == pytest.approx(tuple(sorted(joint.mirror_sign * v for v in joint.range_rad)))
+
+
+def test_the_torsos_inertia_is_what_a_torque_on_it_meets(any_spec):
+    model = build_model(any_spec)
+    model.opt.gravity[:] = 0.0
+    torso = model.body(any_spec.torso_body).id
+    for axis, inertia in enumerate(torso_inertia(any_spec, model)):
+        data = posed(model, default_angles(any_spec), any_spec.base_height_m + 1.0)
+        data.ctrl[:] = [j.kp * j.default_rad for j in any_spec.joints]
+        data.xfrc_applied[torso, 3 + axis] = 1.0
+        mujoco.mj_forward(model, data)
+        jacobian = np.zeros((3, model.nv))
+        mujoco.mj_jacBody(model, data, None, jacobian, torso)
+        assert (jacobian @ data.qacc)[axis] == pytest.approx(1.0 / inertia, rel=1e-6)
 
 
 def touching(model, data) -> set[frozenset[str]]:

@@ -44,8 +44,8 @@ class AssistConfig:
     """A wrench on the torso that carries the robot through its first steps and fades, ever more slowly.
 
     Without it, standing still is a local optimum that plain reward tables do not leave. Gains are in units of the
-    robot's weight, so that they fit any robot. It lifts a constant share of the weight: a lift that grew as the robot
-    sank would teach it to hang.
+    robot's weight, so that they fit any robot; damping is no more than the torso's inertia bears. It lifts a constant
+    share of the weight: a lift that grew as the robot sank would teach it to hang.
     """
 
     enabled: bool = False
@@ -82,16 +82,35 @@ class AssistConfig:
         return min(1.0, (self.end_samples - samples) / max(self.end_samples - self.full_samples, 1.0)) ** 2
 
 
-def assist_wrench(cfg: AssistConfig, spec: RobotSpec, s: RobotState, command: Command) -> torch.Tensor:
-    """Force [N] and torque [Nm] on the torso, (N, 6) in the world frame, at full assistance."""
-    weight = spec.mass_kg * GRAVITY_M_S2
-    lever = weight * spec.nominal_height_m
-    up_w = s.torso_rotation_w[:, :, 2]
-    vertical = torch.tensor([0.0, 0.0, 1.0], device=up_w.device).expand_as(up_w)
-    tilting_w = rotate(s.torso_rotation_w, s.torso_angular_velocity_t) * torch.tensor([1.0, 1.0, 0.0]).to(up_w)
-    torque = cfg.upright_stiffness * torch.linalg.cross(up_w, vertical) - cfg.upright_damping * tilting_w
-    torque = lever * (torque + cfg.yaw_gain * (command.yaw_rate - s.yaw_rate).unsqueeze(1) * vertical)
-    error_h = torch.nn.functional.pad(command.velocity_h - s.torso_linear_velocity_h[:, :2], (0, 1))
-    pull = cfg.velocity_gain * rotate(s.heading_w, error_h)
-    pull = pull * (cfg.force_limit / pull.norm(dim=1, keepdim=True).clamp_min(1e-6)).clamp_max(1.0)
-    return torch.cat((weight * (pull + cfg.weight_share * vertical), torque), 1)
+_DAMPING_SHARE = 1.5
+"""Of the torso's inertia over the control step. A damper that is set once a step makes what it damps sway ever more
+from 2 on; the H1's are below this."""
+
+
+class AssistWrench:
+    """Force [N] and torque [Nm] on the torso, (N, 6) in the world frame, at full assistance.
+
+    Args:
+        cfg: Its gains.
+        spec: The robot, whose weight and height they are units of.
+        inertia: (3,) torque over angular acceleration of the torso about x, y and z [kg m^2], which bounds damping.
+        dt: Control step [s].
+    """
+
+    def __init__(self, cfg: AssistConfig, spec: RobotSpec, inertia: torch.Tensor, dt: float) -> None:
+        self._cfg, self._weight = cfg, spec.mass_kg * GRAVITY_M_S2
+        lever, most = self._weight * spec.nominal_height_m, _DAMPING_SHARE * inertia / dt
+        self._stiffness = lever * cfg.upright_stiffness
+        self._damping = min(lever * cfg.upright_damping, float(most[:2].min()))
+        self._yaw_gain = min(lever * cfg.yaw_gain, float(most[2]))
+
+    def __call__(self, s: RobotState, command: Command) -> torch.Tensor:
+        cfg, up_w = self._cfg, s.torso_rotation_w[:, :, 2]
+        vertical = torch.tensor([0.0, 0.0, 1.0], device=up_w.device).expand_as(up_w)
+        tilting_w = rotate(s.torso_rotation_w, s.torso_angular_velocity_t) * torch.tensor([1.0, 1.0, 0.0]).to(up_w)
+        torque = self._stiffness * torch.linalg.cross(up_w, vertical) - self._damping * tilting_w
+        torque = torque + self._yaw_gain * (command.yaw_rate - s.yaw_rate).unsqueeze(1) * vertical
+        error_h = torch.nn.functional.pad(command.velocity_h - s.torso_linear_velocity_h[:, :2], (0, 1))
+        pull = cfg.velocity_gain * rotate(s.heading_w, error_h)
+        pull = pull * (cfg.force_limit / pull.norm(dim=1, keepdim=True).clamp_min(1e-6)).clamp_max(1.0)
+        return torch.cat((self._weight * (pull + cfg.weight_share * vertical), torque), 1)

@@ -16,7 +16,7 @@ from cotap.envs.actions import JointTargets
 from cotap.envs.actuation import Actuation
 from cotap.envs.commands import CommandSource
 from cotap.envs.config import HumanoidEnvConfig
-from cotap.envs.curriculum import assist_wrench
+from cotap.envs.curriculum import AssistWrench
 from cotap.envs.external_forces import ExternalForces
 from cotap.envs.observer import Observer
 from cotap.envs.path_following import PathFollower
@@ -31,7 +31,7 @@ from cotap.envs.upper_body import UpperBody
 from cotap.motions.reference import ReferenceMotion
 from cotap.reflection import Symmetry
 from cotap.robots import ROBOTS
-from cotap.robots.mjcf import build_model
+from cotap.robots.mjcf import build_model, torso_inertia
 from cotap.sim import make_simulation
 
 
@@ -92,6 +92,7 @@ class HumanoidEnv(VecEnv):
         self.observer = Observer(cfg.observations, spec, n)
         self.recorder = Recorder(spec, self.reader, n, dt, cfg.gait.period_s)
         self._groups = tuple(RewardGroup(g, getattr(cfg.rewards, g), dt) for g in self.reward_groups)
+        self._assist = AssistWrench(cfg.assist, spec, torch.as_tensor(torso_inertia(spec, model)), dt)
         self._torso = model.body(spec.torso_body).id
         self._min_height_m = cfg.terminations.min_height_m(spec)
         self.samples = self.num_diverged = 0
@@ -196,8 +197,7 @@ class HumanoidEnv(VecEnv):
         xfrc = self.sim.xfrc
         self.forces.apply(xfrc, self.state, self.dt * self.episode_length_buf, self.samples)
         if share := self.cfg.assist.share(self.samples):
-            wrench = assist_wrench(self.cfg.assist, self.spec, self.state, self.commands.current())
-            xfrc[:, self._torso] += share * wrench.to(xfrc)
+            xfrc[:, self._torso] += share * self._assist(self.state, self.commands.current()).to(xfrc)
 
     def _advance(self) -> None:
         """Let commands, laws and forces go on by one control step."""

@@ -5,8 +5,10 @@ from __future__ import annotations
 # MuJoCo's extension module has no type stubs.
 # pyright: reportAttributeAccessIssue=false
 import mujoco
+import numpy as np
 
 from cotap.robots.ground import HALF_EXTENT_M, bumps
+from cotap.robots.kinematics import default_angles
 from cotap.robots.spec import BodySpec, GeomSpec, RobotSpec
 
 COLLISIONS = ("feet", "full")
@@ -88,6 +90,21 @@ def hold_base(mj: mujoco.MjSpec, spec: RobotSpec) -> None:
     weld.name1, weld.name2 = spec.base_body, "world"
     weld.data[:] = [0.0, 0.0, 0.0, 0.0, 0.0, -(spec.base_height_m + FIXED_BASE_LIFT_M), 1.0, 0.0, 0.0, 0.0, 1.0]
     weld.solimp[:3] = 0.9999, 0.9999, 0.001
+
+
+def torso_inertia(spec: RobotSpec, model: mujoco.MjModel) -> np.ndarray:
+    """Torque over angular acceleration of the torso link about x, y and z, (3,) [kg m^2].
+
+    In the default pose, with motors that let go: a torso that joints carry turns more easily than the robot as a whole.
+    """
+    data = mujoco.MjData(model)
+    data.qpos[:7] = 0.0, 0.0, spec.base_height_m, 1.0, 0.0, 0.0, 0.0
+    data.qpos[7:] = default_angles(spec)
+    mujoco.mj_forward(model, data)
+    jacobian, moved = np.zeros((3, model.nv)), np.zeros((3, model.nv))
+    mujoco.mj_jacBody(model, data, None, jacobian, model.body(spec.torso_body).id)
+    mujoco.mj_solveM(model, data, moved, jacobian)
+    return 1.0 / (jacobian * moved).sum(1)
 
 
 def _add_bumps(mj: mujoco.MjSpec, unevenness_m: float) -> None:
