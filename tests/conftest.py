@@ -43,9 +43,9 @@ def model(spec: RobotSpec) -> mujoco.MjModel:
     return build_model(spec)
 
 
-@pytest.fixture(scope="session", params=["h1", "made-up"])
+@pytest.fixture(scope="session", params=[*ROBOTS, "made-up"])
 def robot(request: pytest.FixtureRequest) -> str:
-    """Every robot's name in turn."""
+    """The name of every robot that ships, and of the made-up one, in turn."""
     return request.param
 
 

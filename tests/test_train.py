@@ -109,7 +109,7 @@ BAD = [
     ([HIDDEN, 8, 0], ["ppo.hidden[1]", "got 0"]),
     ([STEPS, 0], ["ppo.steps", "got 0"]),
     ([PRECISION, "fp8"], ["precision", "'fp8'", "auto, bf16, fp32"]),
-    ([ROBOT, "h2"], ["robot", "'h2'", "known: h1"]),
+    ([ROBOT, "h2"], ["robot", "'h2'", "known: g1, h1"]),
     ([COLLISION, "foot"], ["collision", "'foot'", "feet", "full"]),
     ([CONTROL_DT, "nan"], ["control_dt", "nan"]),
     ([CONTROL_DT, 0], ["control_dt", "got 0.0"]),

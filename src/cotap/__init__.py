@@ -20,12 +20,13 @@ def _register() -> None:
         from gymnasium.envs.registration import register
     except ImportError:  # the compliance library serves users who have no simulator
         return
-    register(
-        id="CoTaP/H1-v0",
-        entry_point="cotap.envs.gymnasium:HumanoidSingleEnv",
-        vector_entry_point="cotap.envs.gymnasium:HumanoidVectorEnv",
-        kwargs={"robot": "h1"},
-    )
+    for robot in ("h1", "g1"):  # those of cotap.robots.ROBOTS, which this would load
+        register(
+            id=f"CoTaP/{robot.upper()}-v0",
+            entry_point="cotap.envs.gymnasium:HumanoidSingleEnv",
+            vector_entry_point="cotap.envs.gymnasium:HumanoidVectorEnv",
+            kwargs={"robot": robot},
+        )
 
 
 _register()

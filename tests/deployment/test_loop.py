@@ -408,7 +408,7 @@ def _edited(policy_file, tmp_path, name, value):
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("robot", "g1", "for the robot 'g1'; known: h1"),
+        ("robot", "atlas", "for the robot 'atlas'; known: h1, g1"),
         ("joints", [f"joint_{i}" for i in range(19)], "other joints"),
         ("kp", [100.0] * 19, "other kp"),
         ("torque_limit_nm", [300.0] * 19, "other torque_limit_nm"),

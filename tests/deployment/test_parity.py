@@ -73,6 +73,7 @@ class Watched(OnnxPolicy):
 
 KINDS = [(robot, mode, "pd") for robot in ("h1", "made-up") for mode in ("residual", "absolute")]
 KINDS += [("h1", "residual", "cotap"), ("h1", "absolute", "cotap"), ("h1", "residual", "mixed")]
+KINDS += [("g1", "absolute", "pd"), ("g1", "residual", "cotap")]
 
 
 @pytest.mark.parametrize(("name", "mode", "law"), KINDS)

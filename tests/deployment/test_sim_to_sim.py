@@ -118,7 +118,7 @@ def test_statics_is_jacobian_transpose_and_compliance(any_spec, any_model):
         mujoco.mj_jac(model, data, jacobian, None, point, hand.id)
         row = jacobian[2, [model.joint(name).dofadr[0] for name in arm.joints]]
         kp = np.array([spec.joint(name).kp for name in arm.joints])
-        assert torque == pytest.approx(30.0 * abs(row[arm.joints.index(f"{arm.side}_elbow")]), rel=1e-6)
+        assert torque == pytest.approx(30.0 * abs(row[arm.joints.index(spec.body(arm.elbow_body).joint)]), rel=1e-6)
         assert moved == pytest.approx(30.0 * float(row @ (row / kp)), rel=1e-6)
 
 

@@ -13,11 +13,12 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
-import cotap  # noqa: F401 - registers CoTaP/H1-v0
+import cotap  # noqa: F401 - registers the ids
 from cotap.envs import HumanoidEnvConfig
 from cotap.envs.gymnasium import HumanoidSingleEnv, HumanoidVectorEnv
 from cotap.envs.observations import NoiseConfig, ObservationConfig
 from cotap.envs.terminations import TerminationConfig
+from cotap.robots import ROBOTS
 
 SHORT = TerminationConfig(episode_s=0.1)
 NOISY = ObservationConfig(noise=NoiseConfig(enabled=True))
@@ -54,10 +55,12 @@ def test_spaces_follow_the_robot(vector, any_spec):
     assert float(vector.single_action_space.high.max()) == vector.envs.cfg.actions.clip
 
 
-def test_the_h1_by_its_id_is_an_h1():
+@pytest.mark.parametrize("name", [*ROBOTS])
+def test_a_robot_by_its_id_is_that_robot(name):
     """Whatever robot a config names: the id says which."""
-    env = gymnasium.make("CoTaP/H1-v0", cfg=HumanoidEnvConfig(robot="made-up", num_threads=1)).unwrapped
-    assert env.envs.spec.name == "h1"
+    cfg = HumanoidEnvConfig(robot="made-up", num_threads=1)
+    env = gymnasium.make(f"CoTaP/{name.upper()}-v0", cfg=cfg).unwrapped
+    assert env.envs.spec.name == name
 
 
 def test_spaces_of_the_h1():

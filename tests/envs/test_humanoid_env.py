@@ -9,6 +9,7 @@ import math
 import pytest
 import torch
 from env_tools import NOISY, NOMINAL, drive, history_of, hold_still, knock_over, mujoco_of, newest, rollout, zeros
+from robots.joints import called
 
 from cotap.compliance.laws import LawConfig
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
@@ -138,7 +139,7 @@ def test_a_fall_at_the_last_step_is_a_fall(make_env):
 def test_a_fall_is_too_low_for_this_robot(make_env, robot):
     """At nine tenths of its own height: one robot stands, the other squats, feet above the floor."""
     env = make_env(2, robot=robot, randomization=NOMINAL, terminations=TerminationConfig(min_height=0.9))
-    joints = ["left_hip_pitch", "right_hip_pitch", "left_knee", "right_knee"]
+    joints = called(env.spec, "left_hip_pitch", "right_hip_pitch", "left_knee", "right_knee")
     env.sim.qpos[1, 7 + torch.tensor(env.spec.indices(joints))] = torch.tensor([-0.9, -0.9, 1.8, 1.8]).double()
     _, data = mujoco_of(env, 1)
     env.sim.qpos[1, 2] -= min(data.site(f"{foot.side}_foot").xpos[2] for foot in env.spec.feet) - 0.02
@@ -339,7 +340,7 @@ def test_actions_of_another_shape_are_refused(make_env, any_spec):
     ("fields", "match"),
     [
         ({"num_envs": 0}, "num_envs must be a positive integer, got 0"),
-        ({"robot": "h2"}, "robot 'h2' is unknown; known: h1"),
+        ({"robot": "h2"}, "robot 'h2' is unknown; known: g1, h1"),
         ({"collision": "none"}, "collision 'none' is unknown; known: feet, full"),
         ({"control_dt": math.nan}, "control_dt must be a finite number, got nan"),
         ({"substeps": -2}, "substeps must be a positive integer"),

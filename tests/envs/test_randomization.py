@@ -66,7 +66,7 @@ def test_friction_of_the_feet_only(sim, any_model, any_spec, randomizer, rng):
     friction = sim.field("geom_friction")
     names = [f"{foot.body}_collision" for foot in any_spec.feet]
     feet = [g for g in range(any_model.ngeom) if any_model.geom(g).name.startswith(tuple(names))]
-    assert len(feet) == {"h1": 6, "made-up": 2}[any_spec.name]
+    assert len(feet) == {"h1": 6, "g1": 8, "made-up": 2}[any_spec.name]
     sliding = friction[:, feet, 0]
     assert torch.equal(sliding, sliding[:, :1].expand(-1, len(feet)))  # one ground under both feet
     assert 0.5 <= float(sliding.min()) < 0.52

@@ -317,17 +317,19 @@ def test_scales_follow_the_robot(any_spec):
         assert float(scales.default_position[i]) == pytest.approx(joint.default_rad)
 
 
-def test_scales_by_hand_for_either_robot(any_spec):
+def test_scales_by_hand(any_spec):
     scales = RobotScales.of(any_spec)
+    hips = ("left_hip_roll", "left_hip_yaw", "right_hip_roll", "right_hip_yaw", "waist_yaw", "waist_roll")
     sideways = {
         "h1": ("left_hip_yaw", "left_hip_roll", "right_hip_yaw", "right_hip_roll", "torso"),
-        "made-up": ("left_hip_roll", "left_hip_yaw", "right_hip_roll", "right_hip_yaw", "waist_yaw", "waist_roll"),
+        "g1": tuple(f"{name}_joint" for name in hips),
+        "made-up": hips,
     }
     assert tuple(any_spec.joint_names[i] for i in scales.hip_waist) == sideways[any_spec.name]
     # Soles of the made-up robot are 2 * (0.07 + 0.03) m apart.
-    distance = {"h1": 0.45 * any_spec.sole_distance_m, "made-up": 0.45 * 0.2}
+    distance = {"h1": 0.45 * any_spec.sole_distance_m, "g1": 0.45 * 0.237013, "made-up": 0.45 * 0.2}
     assert scales.foot_distance_m == pytest.approx(distance[any_spec.name], abs=1e-6)
-    clearance = {"h1": 0.10205, "made-up": 0.08028}
+    clearance = {"h1": 0.10205, "g1": 0.0828699, "made-up": 0.08028}
     assert scales.foot_clearance_m == pytest.approx(clearance[any_spec.name], abs=1e-6)
     assert 0.1 < RobotScales.of(any_spec).foot_distance_m / 0.45 < 0.5
 

@@ -21,10 +21,10 @@ from cotap.envs import HumanoidEnv
 NUM_ENVS, STEPS = 6, 4
 
 
-def training() -> BaseTraining:
+def training(robot: str = "made-up") -> BaseTraining:
     """The recipe that ships, pushes, loads and assistance included, on another robot and tiny."""
     out = BASE_RECIPES["default"]()
-    out.env.robot, out.env.num_envs, out.env.num_threads = "made-up", NUM_ENVS, 1
+    out.env.robot, out.env.num_envs, out.env.num_threads = robot, NUM_ENVS, 1
     out.ppo = dataclasses.replace(out.ppo, steps=STEPS, hidden=(16,), epochs=1, mini_batches=2)
     return out
 
@@ -70,8 +70,9 @@ def test_its_mirror_image_is_its_own(make_env, rng):
     assert torch.equal(env.symmetry.actions(mirrored), a)
 
 
-def test_it_trains_and_goes_on_exactly(tmp_path):
-    cfg = training()
+@pytest.mark.parametrize("name", ["g1", "made-up"])
+def test_it_trains_and_goes_on_exactly(name, tmp_path):
+    cfg = training(name)
     straight = runner_of(cfg, tmp_path / "straight")
     begin = {k: v.clone() for k, v in straight.alg.model.state_dict().items()}
     straight.learn()
@@ -80,7 +81,7 @@ def test_it_trains_and_goes_on_exactly(tmp_path):
     assert any(not torch.equal(v, begin[k]) for k, v in learned.items())
     assert straight.env.samples == 2 * STEPS * NUM_ENVS
     content = load_checkpoint(tmp_path / "straight" / "checkpoint_000002.pt")
-    assert content["layout"]["robot"] == "made-up"
+    assert content["layout"]["robot"] == name
     assert content["layout"]["joints"] == list(straight.env.spec.joint_names)
     runner_of(cfg, tmp_path / "parts", 1).learn()
     resumed = runner_of(cfg, tmp_path / "parts")

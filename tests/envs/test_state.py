@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from robots.joints import called
 
 from cotap.envs.state import StateReader
 from cotap.sim import BatchSimulation
@@ -121,7 +122,7 @@ def test_foot_force_and_contact(any_spec, any_model):
     qpos = torch.zeros(1, model.nq)
     qpos[0, 2], qpos[0, 3] = spec.base_height_m - 0.003, 1.0
     qpos[0, 7:] = torch.tensor([j.default_rad for j in spec.joints])
-    lifted = spec.indices(["right_hip_pitch", "right_knee"])
+    lifted = spec.indices(called(spec, "right_hip_pitch", "right_knee"))
     qpos[0, 7 + torch.tensor(lifted)] += torch.tensor([-0.5, 0.9])
     sim.reset(torch.ones(1, dtype=torch.bool), qpos, torch.zeros(1, model.nv))
     state = StateReader(spec, sim).read()

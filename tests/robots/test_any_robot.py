@@ -10,7 +10,7 @@ import pytest
 import torch
 from robots.made_up import made_up
 
-from cotap.compliance.dynamics import joint_inertia
+from cotap.compliance.dynamics import gravity_torque, joint_inertia
 from cotap.robots.chains import arm_chains, arm_model
 from cotap.robots.kinematics import body_frame, default_angles
 from cotap.robots.mjcf import FIXED_BASE_LIFT_M, build_model, torso_inertia
@@ -59,7 +59,7 @@ def test_order_is_mujocos(any_spec, any_model):
 
 def test_mass_is_the_models(any_spec, any_model):
     assert any_spec.mass_kg == pytest.approx(any_model.body_mass.sum(), abs=1e-9)
-    assert any_spec.mass_kg == pytest.approx({"h1": 51.437, "made-up": 34.6}[any_spec.name], abs=1e-9)
+    assert any_spec.mass_kg == pytest.approx({"h1": 51.437, "g1": 33.341142, "made-up": 34.6}[any_spec.name], abs=1e-9)
 
 
 def test_what_joints_have_of_their_own_reaches_the_model(any_spec, any_model):
@@ -70,7 +70,7 @@ def test_what_joints_have_of_their_own_reaches_the_model(any_spec, any_model):
         np.testing.assert_array_equal(motor.biasprm[:3], [0.0, -joint.kp, -joint.kd])
         np.testing.assert_array_equal(motor.forcerange, [-joint.torque_limit_nm, joint.torque_limit_nm])
     own = len({j.armature_kg_m2 for j in any_spec.joints})
-    assert own == {"h1": 1, "made-up": 15}[any_spec.name]
+    assert own == {"h1": 1, "g1": 5, "made-up": 15}[any_spec.name]
 
 
 def test_body_frames_are_mujocos(any_spec, any_model):
@@ -150,6 +150,24 @@ def test_arms_are_mujocos(any_spec, any_model):
             np.testing.assert_allclose(inertia[0, i], full[np.ix_(dofs, dofs)], atol=1e-7)
 
 
+def test_hands_feet_and_the_arms_weight_at_a_hundred_poses(any_spec, any_model):
+    arms = arm_model(any_spec, torch.float64)
+    for seed in range(100):
+        data = tumbling(any_model, any_spec, seed)
+        torso = data.body(any_spec.torso_body).xmat.reshape(3, 3)
+        pose = arms.chains.pose(arm_angles(any_spec, data.qpos[7:]))
+        weight = gravity_torque(arms.inertias, pose, torch.from_numpy(torso[2:].copy()))
+        for i, arm in enumerate(any_spec.arms):
+            hand = in_frame(data, any_spec.torso_body, data.site(f"{arm.side}_hand").xpos)
+            np.testing.assert_allclose(pose.tip[0, i], hand, atol=1e-6)
+            dofs = [any_model.joint(n).dofadr[0] for n in arm.joints]
+            np.testing.assert_allclose(weight[0, i], data.qfrc_bias[dofs], atol=1e-6)
+        for foot in any_spec.feet:
+            position, rotation = body_frame(any_spec, foot.body, any_spec.base_body, data.qpos[7:])
+            sole = in_frame(data, any_spec.base_body, data.site(f"{foot.side}_foot").xpos)
+            np.testing.assert_allclose(position + rotation @ foot.sole, sole, atol=1e-6)
+
+
 def test_arms_keep_their_joints_numbers_in_either_precision(any_spec):
     for dtype in (torch.float32, torch.float64):
         for arms in (arm_model(any_spec, dtype), arm_model(any_spec).to(dtype)):
@@ -169,16 +187,17 @@ def test_mirrored_angles_give_the_mirror_image(any_spec, any_model):
     mirrored = np.array([j.mirror_sign * q[any_spec.indices([j.mirror_name])[0]] for j in any_spec.joints])
     plain, image = posed(any_model, q), posed(any_model, mirrored)
     flip = np.array([1.0, -1.0, 1.0])
-    # The H1's published frames differ between left and right in the seventh digit.
+    # The H1's published frames differ between left and right in the seventh digit, the G1's shoulders by 0.01 mm.
+    atol = {"h1": 1e-6, "g1": 3e-5, "made-up": 1e-6}[any_spec.name]
     for body in any_spec.bodies:
         side = body.name.split("_")[0]
         other = body.name.replace(side, SWAP.get(side, side), 1)
         seen = image.body(other).xpos
-        np.testing.assert_allclose(seen, plain.body(body.name).xpos * flip, atol=1e-6, err_msg=body.name)
+        np.testing.assert_allclose(seen, plain.body(body.name).xpos * flip, atol=atol, err_msg=body.name)
     for site in ("hand", "foot"):
         for side, other in SWAP.items():
             seen = image.site(f"{other}_{site}").xpos
-            np.testing.assert_allclose(seen, plain.site(f"{side}_{site}").xpos * flip, atol=1e-6)
+            np.testing.assert_allclose(seen, plain.site(f"{side}_{site}").xpos * flip, atol=atol)
 
 
 def test_limits_and_the_default_pose_are_their_own_mirror_image(any_spec):
@@ -253,5 +272,5 @@ def test_a_held_base_stays_where_it_is_put(any_spec):
 def test_arms_of_any_length_have_full_rank_in_the_default_pose(any_spec):
     chains = arm_chains(any_spec, torch.float64)
     jacobian = chains.jacobian(chains.pose(arm_angles(any_spec, default_angles(any_spec))))
-    assert jacobian.shape[-1] == {"h1": 4, "made-up": 7}[any_spec.name]
+    assert jacobian.shape[-1] == {"h1": 4, "g1": 7, "made-up": 7}[any_spec.name]
     assert float(torch.linalg.svdvals(jacobian).min()) > 0.02

@@ -1,4 +1,7 @@
-"""The environment as Gymnasium sees it: `gymnasium.make_vec("CoTaP/H1-v0", num_envs=64)`, or one env with `make`."""
+"""The environment as Gymnasium sees it: `gymnasium.make_vec("CoTaP/H1-v0", num_envs=64)`, or one env with `make`.
+
+Every robot that ships has such an id.
+"""
 
 from __future__ import annotations
 

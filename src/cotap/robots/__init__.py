@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from cotap.robots.g1 import g1
 from cotap.robots.h1 import h1
 from cotap.robots.spec import ArmSpec, BodySpec, FootSpec, GeomSpec, JointSpec, RobotSpec
 
-ROBOTS: dict[str, Callable[[], RobotSpec]] = {"h1": h1}
+ROBOTS: dict[str, Callable[[], RobotSpec]] = {"h1": h1, "g1": g1}
 
-__all__ = ["ROBOTS", "ArmSpec", "BodySpec", "FootSpec", "GeomSpec", "JointSpec", "RobotSpec", "h1"]
+__all__ = ["ROBOTS", "ArmSpec", "BodySpec", "FootSpec", "GeomSpec", "JointSpec", "RobotSpec", "g1", "h1"]
