@@ -1,0 +1,190 @@
+"""From somebody's MJCF to a robot: the documentation's own steps, MuJoCo's word for the result, what is refused."""
+
+from __future__ import annotations
+
+import re
+import runpy
+import shlex
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from robots.third import mjcf
+
+from cotap.agents.checkpoint import load_checkpoint
+from cotap.envs import HumanoidEnv, HumanoidEnvConfig
+from cotap.robots import ROBOTS
+from cotap.robots.from_mjcf import facts_of, facts_text, main
+from cotap.robots.kinematics import default_angles
+from cotap.robots.mjcf import build_mjspec, build_model
+
+DOCS = Path(__file__).parents[2] / "docs"
+EXAMPLE = DOCS / "examples" / "robot.py"
+NAME = "my-robot"
+
+
+@pytest.fixture
+def own(tmp_path, monkeypatch):
+    """The third humanoid, brought in as the page says."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(ROBOTS, NAME, None)  # so that what the example adds is taken out again
+    Path("robot.xml").write_text(mjcf())
+    for line in commands("from_mjcf"):
+        assert main(line) == 0
+    runpy.run_path(str(EXAMPLE))
+    return ROBOTS[NAME]()
+
+
+def commands(program: str) -> list[list[str]]:
+    """Arguments of the page's commands that run `program`."""
+    lines = re.findall(rf"^python .*\b{program}(?:\.py)? (.*)$", (DOCS / "robots.md").read_text(), re.M)
+    return [shlex.split(line, comments=True) for line in lines]
+
+
+def test_the_page_shows_the_example(own):
+    assert own.name == NAME
+    assert EXAMPLE.read_text().split('"""\n\n', 1)[1] in (DOCS / "robots.md").read_text()
+
+
+def test_it_is_a_robot_like_any_other(own):
+    assert own.lower_joints[-1] == "waist"
+    assert [own.joint(f"{s}_shoulder_roll").mirror_sign for s in "lr"] == [1.0, 1.0]  # its axis is turned about
+    assert own.joint("l_shoulder_roll").mirror_name == "r_shoulder_roll"
+    assert own.joint("waist").mirror_sign == -1.0
+    limits = [own.joint(f"l_{part}").torque_limit_nm for part in ("hip_roll", "hip_pitch", "knee", "elbow")]
+    assert limits == [120.0, 150.0, 140.0, 25.0]
+    assert {j.velocity_limit_rad_s for j in own.joints} == {12.0}
+    assert own.contact_excludes == (("hips", "chest"), ("hips", "l_thigh"), ("hips", "r_thigh"))  # the head is fixed
+    assert {body.name for body in own.bodies}.isdisjoint({"head", "l_hand", "r_hand"})
+    assert own.mass_kg == pytest.approx(6 + 14 + 2 + 2 * (0.8 + 0.7 + 0.9 + 0.6 + 0.3 + 1 + 4 + 2.5 + 1))
+
+
+def test_it_moves_as_in_its_own_file(own):
+    """Joint-space inertia, weight and forearms at random poses; MuJoCo reads the one file, cotap makes the other."""
+    theirs, ours = mujoco.MjModel.from_xml_string(mjcf(base="<freejoint/>")), build_model(own)
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        seen = []
+        angles = {j.name: rng.uniform(*j.range_rad) for j in own.joints}
+        for model in (theirs, ours):
+            data = mujoco.MjData(model)
+            data.qpos[:7] = [0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0]
+            for name, angle in angles.items():
+                data.joint(name).qpos[0] = angle
+            mujoco.mj_forward(model, data)
+            dofs = [*range(6), *(model.joint(j).dofadr[0] for j in own.joint_names)]
+            columns = [np.zeros(model.nv) for _ in dofs]
+            for dof, column in zip(dofs, columns, strict=True):
+                mujoco.mj_mulM(model, data, column, np.eye(model.nv)[dof])
+            forearms = [data.body(f"{s}_forearm").xpos for s in "lr"]
+            seen.append((np.array(columns)[:, dofs], data.qfrc_bias[dofs], forearms))
+        for a, b in zip(*seen, strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-6)
+
+
+def test_it_stands_steps_and_is_mirrored(own):
+    env = HumanoidEnv(HumanoidEnvConfig(robot=NAME, num_envs=2, num_threads=1))
+    for _ in range(10):
+        _, reward, done, _ = env.step(torch.zeros(2, env.num_actions))
+        assert torch.isfinite(reward).all()
+        assert not done.any()
+    action = torch.randn(2, len(own.joints), generator=torch.Generator().manual_seed(0))
+    left, right = own.indices(["l_hip_roll", "r_hip_roll"])
+    mirrored = env.symmetry.actions(action)
+    assert torch.equal(mirrored[:, left], action[:, right])
+    data = mujoco.MjData(build_model(own))
+    data.qpos[2], data.qpos[7:] = own.base_height_m, default_angles(own)
+    mujoco.mj_forward(build_model(own), data)
+    assert data.site("left_foot").xpos[2] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_it_trains_as_the_page_says(own, monkeypatch):  # noqa: ARG001
+    (arguments,) = commands("robot")
+    few = ["--env.num-envs", "4", "--runner.iterations", "1", "--threads", "1", "--ppo.steps", "4"]
+    monkeypatch.setattr("sys.argv", ["robot.py", *arguments, *few])
+    with pytest.raises(SystemExit) as end:
+        runpy.run_path(str(EXAMPLE), run_name="__main__")
+    assert end.value.code == 0
+    assert load_checkpoint(Path("runs/my-robot/checkpoint_000001.pt"))["layout"]["robot"] == NAME
+
+
+def test_what_cotap_makes_of_a_robot_gives_its_facts_back(any_spec, tmp_path):
+    path = tmp_path / "robot.xml"
+    mj = build_mjspec(any_spec, "full")
+    mj.compile()
+    path.write_text(mj.to_xml())
+    facts = facts_of(path)
+    assert [entry["name"] for entry in facts["bodies"]] == [body.name for body in any_spec.bodies]
+    assert {frozenset(pair) for pair in facts["contact_excludes"]} == {*map(frozenset, any_spec.contact_excludes)}
+    for entry, body in zip(facts["bodies"], any_spec.bodies, strict=True):
+        assert entry["mass"] == pytest.approx(body.mass_kg)
+        np.testing.assert_allclose(entry["pos"], body.pos, atol=1e-9)
+        np.testing.assert_allclose(entry["diaginertia"], body.diaginertia, rtol=1e-5)  # the XML has six digits
+        assert [g["type"] for g in entry["collision_geoms"]] == [g.type for g in body.collision]
+        if body.joint:
+            joint, own = entry["joint"], any_spec.joint(body.joint)
+            assert (joint["mirror"], joint["mirror_sign"]) == (own.mirror_name, own.mirror_sign)
+            assert joint["torque_limit_nm"] == own.torque_limit_nm
+            assert tuple(joint["range_rad"]) == pytest.approx(own.range_rad)
+
+
+def test_a_vector_has_a_line():
+    assert facts_text({"a": [1.0, 2.0], "b": [{"c": [[0, 1], [2, 3]]}], "d": []}) == (
+        '{\n "a": [1.0, 2.0],\n "b": [\n  {\n   "c": [\n    [0, 1],\n    [2, 3]\n   ]\n  }\n ],\n "d": []\n}\n'
+    )
+
+
+TWO_JOINTS = '<body name="odd"><joint name="a" axis="0 1 0"/><joint name="b" axis="0 0 1"/><geom size="0.1"/></body>'
+LONE = '<body name="odd"><joint name="odd" axis="0 1 0" range="-9 9" actuatorfrcrange="-1 1"/><geom size="0.1"/></body>'
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            mjcf(base=TWO_JOINTS.replace("/>", ' range="-9 9" actuatorfrcrange="-1 1"/>', 2)),
+            "'odd' must be moved by one",
+        ),
+        (mjcf(base=LONE.replace(' range="-9 9"', "")), "joint 'odd' needs a range"),
+        (mjcf(base=LONE.replace(' actuatorfrcrange="-1 1"', "")), "joint 'odd' needs a torque limit"),
+        (mjcf(base=LONE.replace("<joint", '<joint pos="0 0 0.1"')), "'odd' must lie in its body's origin"),
+        (
+            mjcf(base=LONE.replace("<joint", '<joint ref="5"')),
+            "'odd' must lie in its body's origin and count from zero",
+        ),
+        (mjcf(base=LONE.replace('name="odd"', "")), "bodies and joints need names; below 'hips'"),
+        (
+            mjcf(base=LONE.replace('<body name="odd"', '<body name="odd" pos="0 1 0"')),
+            "joint 'odd' needs one mirror image at zero angles, found none",
+        ),
+        (
+            mjcf().replace("</worldbody>", f"{LONE}</worldbody>"),
+            "one body of the world must carry the robot, got hips, odd",
+        ),
+        (mjcf().replace('"box"', '"plane"'), "plane"),
+        ("<mujoco/>", "one body of the world must carry the robot, got none"),
+        ("rubbish", "XML"),
+    ],
+)
+def test_what_cannot_be_a_robot_is_named(text, message, tmp_path, capsys):
+    (tmp_path / "robot.xml").write_text(text)
+    assert main(["--mjcf", str(tmp_path / "robot.xml"), "--output", str(tmp_path / "robot.json")]) == 2
+    assert re.search(message, capsys.readouterr().err)
+    assert not (tmp_path / "robot.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--mjcf", "none.xml", "--output", "robot.json"], "MJCF 'none.xml' does not exist"),
+        (["--mjcf", "none.xml", "--output", "robot.xml"], "--output must end in .json, got 'robot.xml'"),
+        (["--mjcf", "none.xml", "--output", "no/robot.json"], "its folder does not exist"),
+        (["--mjcf", "none.xml", "--output", "robot.json", "--velocity-limit", "0"], "velocity_limit must lie in"),
+    ],
+)
+@pytest.mark.usefixtures("in_tmp_path")
+def test_bad_input_is_named(arguments, message, capsys):
+    assert main(arguments) == 2
+    assert message in capsys.readouterr().err
