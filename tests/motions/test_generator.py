@@ -16,7 +16,11 @@ def bounds(spec) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     joints = [j for j in spec.joints if j.name in spec.upper_joints]
     low = [max(j.range_rad[0] + 0.1, j.default_rad - 1.2) for j in joints]
     high = [min(j.range_rad[1] - 0.1, j.default_rad + 1.2) for j in joints]
-    return torch.tensor(low), torch.tensor(high), torch.tensor([0.5 * j.velocity_limit_rad_s for j in joints])
+    return (
+        torch.tensor(low),
+        torch.tensor(high),
+        torch.tensor([min(0.5 * j.velocity_limit_rad_s, 10.0) for j in joints]),
+    )
 
 
 def arm_by_arm(values: torch.Tensor, spec) -> torch.Tensor:

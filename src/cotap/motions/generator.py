@@ -32,6 +32,8 @@ class MotionConfig:
     """Weight of both arms swinging in opposition, as in walking."""
     velocity_share: float = 0.5
     """Fastest reference, as a share of each joint's velocity limit."""
+    largest_speed: float = 10.0
+    """Fastest reference of any joint [rad/s]: limits that hold without a load say little of what an arm can follow."""
     limit_margin_rad: float = 0.1
     """Distance kept from joint limits [rad]."""
     range_rad: float = 1.2
@@ -44,6 +46,7 @@ class MotionConfig:
         if sum(getattr(self, kind) for kind in KINDS) <= 0.0:
             raise ValueError(f"motions: at least one weight of {', '.join(KINDS)} must be positive, got all 0")
         require_range("motions.velocity_share", self.velocity_share, 0.01, 1.0)
+        require_range("motions.largest_speed", self.largest_speed, 0.1, 1e3)
         require_range("motions.limit_margin_rad", self.limit_margin_rad, 0.0, 1.0)
         require_range("motions.range_rad", self.range_rad, 0.0, math.pi)
 
@@ -75,7 +78,8 @@ class MotionGenerator(Stateful):
         self.default = default
         self._low = torch.maximum(low + cfg.limit_margin_rad, default - cfg.range_rad)
         self._high = torch.minimum(high - cfg.limit_margin_rad, default + cfg.range_rad)
-        self._speed = cfg.velocity_share * torch.tensor([j.velocity_limit_rad_s for j in joints])
+        limit = torch.tensor([j.velocity_limit_rad_s for j in joints])
+        self._speed = (cfg.velocity_share * limit).clamp_max(cfg.largest_speed)
         self._joints_per_arm = len(spec.arms[0].joints)
         self._weights = torch.tensor([float(getattr(cfg, kind)) for kind in KINDS])
         n, u = num_envs, len(joints)
