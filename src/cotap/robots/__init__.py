@@ -1,4 +1,4 @@
-"""Robots by name. A new robot is one file that builds a RobotSpec, and one line here."""
+"""Robots by name. A new robot is a file of facts, one file that builds a RobotSpec of them, and one line here."""
 
 from __future__ import annotations
 
