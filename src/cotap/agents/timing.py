@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING
+from typing import Any
+
+from rsl_rl.env import VecEnv
 
 from cotap.agents.actors import as_dict
 from cotap.agents.dual_ppo import DualPPO, DualPPOConfig
 from cotap.agents.runner import layout_of
-
-if TYPE_CHECKING:
-    from cotap.envs import HumanoidEnv
 
 
 class TimedTraining:
@@ -22,8 +21,8 @@ class TimedTraining:
         device: Where the networks live.
     """
 
-    def __init__(self, env: HumanoidEnv, ppo: DualPPOConfig, device: str = "cpu") -> None:
-        self.env = env
+    def __init__(self, env: VecEnv, ppo: DualPPOConfig, device: str = "cpu") -> None:
+        self.env: Any = env
         self.alg = DualPPO(layout_of(env, ppo.symmetric), env.num_envs, ppo, device)
 
     def run(self) -> float:
