@@ -8,8 +8,6 @@ import shutil
 import sys
 from pathlib import Path
 
-from cotap.graphics import choose_opengl
-
 OUT = Path("runs/demo")
 ITERATIONS = 6
 IMPACT = ["impact", "--num-envs", "256", "--force", "500", "0", "0"]
@@ -25,7 +23,6 @@ MEASURES = {
 def main(argv: list[str] | None = None) -> int:
     """Distil for a few iterations from the shipped base, then evaluate the shipped policy. Exit status."""
     argparse.ArgumentParser(description=__doc__).parse_args(argv)
-    choose_opengl()
     from cotap.evaluate import main as evaluate
     from cotap.evaluation.policy import default_checkpoint, shipped_checkpoint
     from cotap.train import main as train

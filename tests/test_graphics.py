@@ -27,6 +27,19 @@ def test_what_is_there_is_chosen_and_a_choice_is_kept(driver, libraries, before,
     assert os.environ.get("MUJOCO_GL") == chosen
 
 
+def test_mujoco_draws_with_what_is_chosen_after_it_was_imported(monkeypatch):
+    module = "mujoco.rendering.classic.gl_context"
+    loaded = []
+    monkeypatch.setattr(graphics.importlib, "reload", loaded.append)
+    monkeypatch.setattr(graphics, "choose_opengl", lambda: os.environ.setdefault("MUJOCO_GL", "osmesa"))
+    monkeypatch.setenv("MUJOCO_GL", "glfw")
+    graphics.bind_opengl()  # a choice that was made is kept
+    assert loaded == []
+    monkeypatch.delenv("MUJOCO_GL")
+    graphics.bind_opengl()
+    assert loaded == [sys.modules[module]]
+
+
 def test_mujoco_can_be_imported_with_what_is_chosen_here():
     environment = {name: value for name, value in os.environ.items() if name != "MUJOCO_GL"}
     code = "from cotap.graphics import choose_opengl; choose_opengl(); import mujoco"

@@ -11,6 +11,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import torch
+from tqdm import tqdm
 
 from cotap.agents.actors import as_dict
 from cotap.checks import reason_of
@@ -18,6 +19,7 @@ from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.evaluation.rollout import PolicyFunction
 from cotap.evaluation.undisturbed import disable_disturbances
 from cotap.files import write_atomically
+from cotap.graphics import bind_opengl
 from cotap.robots import RobotSpec
 from cotap.robots.mjcf import build_model
 
@@ -32,6 +34,8 @@ TOUR = (
     (3.0, 0.0, 0.0, 0.0, True, -0.2),
 )
 """A short tour of everything that the base policy is asked to do."""
+STRIDE = 2
+"""Control steps from one picture of a film to the next."""
 
 
 class RenderingUnavailable(OSError):
@@ -45,6 +49,7 @@ def open_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Rend
         RenderingUnavailable: there is no OpenGL to be had.
     """
     try:
+        bind_opengl()
         return mujoco.Renderer(model, height, width)
     except ValueError:  # a picture larger than the model's frame buffer: the caller's mistake, not the machine's
         raise
@@ -54,6 +59,11 @@ def open_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Rend
             "install OSMesa (Debian, Ubuntu: apt-get install libosmesa6) and set MUJOCO_GL=osmesa; now MUJOCO_GL="
             f"{os.environ.get('MUJOCO_GL', 'unset')}"
         ) from error
+
+
+def require_renderer() -> None:
+    """Find out before the work, rather than after it, that there is no OpenGL. Raises RenderingUnavailable."""
+    open_renderer(mujoco.MjSpec().compile(), 16, 16).close()
 
 
 def render_frames(
@@ -125,11 +135,17 @@ def film_video(path: Path, env: HumanoidEnv, film: torch.Tensor, sheet: Path | N
     Raises:
         RenderingUnavailable: there is no OpenGL to be had.
     """
-    stride = 2
-    frames = list(film_frames(env, film[::stride]))
-    write_video(path, iter(frames), 1.0 / (env.dt * stride))
+    part = film[::STRIDE]
+    write_film(path, film_frames(env, part), len(part), env.dt, sheet)
+
+
+def write_film(path: Path, frames: Iterator[np.ndarray], count: int, dt: float, sheet: Path | None = None) -> None:
+    """Write a video of `count` frames, one for every `STRIDE` control steps of `dt` [s], and a contact sheet; shows
+    how far it is."""
+    drawn = list(tqdm(frames, desc="filming", total=count, unit="frame", disable=None, leave=False))
+    write_video(path, iter(drawn), 1.0 / (dt * STRIDE))
     if sheet is not None:
-        contact_sheet(sheet, frames[:: max(1, len(frames) // 24)][:24], 6)
+        contact_sheet(sheet, drawn[:: max(1, len(drawn) // 24)][:24], 6)
 
 
 def write_video(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
@@ -180,8 +196,5 @@ def tour_video(path: Path, cfg: HumanoidEnvConfig, policy: PolicyFunction, sheet
         RenderingUnavailable: there is no OpenGL to be had.
     """
     env, qpos = record_tour(cfg, policy)
-    stride = 2
-    frames = list(render_frames(env.spec, qpos[::stride]))
-    write_video(path, iter(frames), 1.0 / (env.dt * stride))
-    if sheet is not None:
-        contact_sheet(sheet, frames[:: max(1, len(frames) // 24)][:24], 6)
+    part = qpos[::STRIDE]
+    write_film(path, render_frames(env.spec, part), len(part), env.dt, sheet)
