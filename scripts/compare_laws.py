@@ -1,6 +1,6 @@
 """Every law of the arms side by side: the paper's Table VI and Fig. 9, and what backs its Table I.
 
-python scripts/compare_laws.py static --pelvis free --repeats 64
+python scripts/compare_laws.py static --pelvis free --num-envs 384
 python scripts/compare_laws.py transient --num-envs 256
 python scripts/compare_laws.py properties
 
@@ -25,9 +25,10 @@ from paper_tables import PROPERTIES, STATIC
 from cotap.agents.checkpoint import write_json
 from cotap.checks import require_one_of, require_range
 from cotap.compare import difference
+from cotap.compliance.laws import LawConfig, reads
 from cotap.configs import to_plain
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
-from cotap.evaluate import Options, RolloutOptions, run
+from cotap.evaluate import Options, run
 from cotap.evaluation.disturbance import Impact
 from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.protocol import HELD
@@ -64,13 +65,12 @@ STRUCK = (
     "cotap+facet, joint error", "cotap+facet-matched, joint error",
 )  # fmt: skip
 """Rows that are struck."""
-NULL_STIFFNESS = 25.0
-"""[Nm/rad]."""
 
 
-def laws_of(name: str, stiffness: float, sensing: str = "privileged") -> LawOptions:
-    """The laws of a row."""
-    return LawOptions(stiffness=(stiffness,), null_stiffness=NULL_STIFFNESS, sensing=sensing, **ROWS[name])
+def laws_of(name: str, stiffness: float, null_stiffness: float, sensing: str = "privileged") -> LawOptions:
+    """The laws of a row; what its law does not read is left out."""
+    common = {"stiffness": (stiffness,), "null_stiffness": null_stiffness, "sensing": sensing}
+    return LawOptions(**{k: v for k, v in common.items() if reads(ROWS[name]["method"], k)}, **ROWS[name])
 
 
 @dataclass
@@ -83,8 +83,10 @@ class Static:
     """free or fixed."""
     stiffness: float = 500.0
     """Of the hand, along all axes [N/m]."""
-    repeats: int = 16
-    """Worlds per load."""
+    null_stiffness: float = LawConfig.null_stiffness
+    """Stiffness of arm motion that leaves the hand where it is [Nm/rad]."""
+    num_envs: int = 96
+    """Number of envs, dealt to the loads (0, 10, ... 50 N) evenly."""
     settle_seconds: float = 8.0
     """How long a load is left to settle [s]; the last second is measured."""
     upper_actions: str = "reference"
@@ -108,11 +110,11 @@ class Static:
         for name in self.laws:
             # 0, 10, ..., 50 N, each in envs of its own.
             protocol = StaticStiffness(
-                force=(0.0, 0.0, -50.0), pelvis=self.pelvis, levels=6, num_envs=6 * self.repeats, seed=self.seed,
+                force=(0.0, 0.0, -50.0), pelvis=self.pelvis, levels=6, num_envs=self.num_envs, seed=self.seed,
                 settle_seconds=self.settle_seconds, upper_actions=self.upper_actions,
                 torque_limit_scale=self.torque_limit_scale,
             )  # fmt: skip
-            laws = laws_of(name, self.stiffness, self.sensing)
+            laws = laws_of(name, self.stiffness, self.null_stiffness, self.sensing)
             options = Options(protocol, laws, checkpoint=self.checkpoint, threads=self.threads)
             with redirect_stdout(StringIO()):  # its own table
                 result = run("static-stiffness", options)
@@ -121,7 +123,7 @@ class Static:
             rows[name] = {
                 "displacement": [m for m, _ in moved],
                 # Of the mean; envs that fell are few or the mean is none.
-                "half_interval": [1.96 * std / self.repeats**0.5 for _, std in moved],
+                "half_interval": [1.96 * std / (self.num_envs / 6) ** 0.5 for _, std in moved],
                 "torque_saturated": result["torque_saturated"],
                 "num_falls": result["num_falls"],
                 "num_envs": result["num_envs"],
@@ -148,7 +150,7 @@ class Static:
             pairs = zip(row["displacement"], result["ideal"], strict=True)
             if all(got is not None and abs(got / ideal - 1.0) <= 0.1 for got, ideal in pairs):
                 near.append(name)
-        pelvis = f"Pelvis {self.pelvis}, {self.repeats} envs per load, {self.stiffness:g} N/m."
+        pelvis = f"Pelvis {self.pelvis}, {self.num_envs / 6:g} envs per load, {self.stiffness:g} N/m."
         return "\n".join([*lines, "", f"{pelvis} Within 10 % of ideal at all loads: {'; '.join(near) or 'none'}."])
 
     def draw(self, result: dict[str, Any]) -> Any:
@@ -170,6 +172,8 @@ class Transient:
     """Along x on the left hand, for 50 ms [N]. The smaller leaves arms under PD and CoTaP below their torque limits."""
     stiffness: float = 500.0
     """Of the hand, along all axes [N/m]."""
+    null_stiffness: float = LawConfig.null_stiffness
+    """Stiffness of arm motion that leaves the hand where it is [Nm/rad]."""
     num_envs: int = 64
     """Worlds per law and force."""
     mode: str = "stance"
@@ -200,8 +204,8 @@ class Transient:
                     upper_actions=self.upper_actions, torque_limit_scale=self.torque_limit_scale,
                     force=(force, 0.0, 0.0),
                 )  # fmt: skip
-                laws = laws_of(name, self.stiffness)
-                options = RolloutOptions(protocol, laws, checkpoint=self.checkpoint, threads=self.threads)
+                laws = laws_of(name, self.stiffness, self.null_stiffness)
+                options = Options(protocol, laws, checkpoint=self.checkpoint, threads=self.threads)
                 with redirect_stdout(StringIO()):  # its own table
                     result = run("impact", options)
                 kept = ("num_envs", "num_falls", "metrics", "window", "curve")
@@ -271,6 +275,8 @@ class Properties:
     stability: Stability = field(default_factory=Stability)
     stiffness: float = 500.0
     """[N/m]; the effect of changing it is that between half and twice of it."""
+    null_stiffness: float = LawConfig.null_stiffness
+    """Stiffness of arm motion that leaves the hand where it is [Nm/rad]."""
     load: float = 5.0
     """Downward, on the left hand [N]."""
     wrong_length: float = 1.1
@@ -294,7 +300,7 @@ class Properties:
             k = self.stiffness
             (soft, stiff, right), at = self._moved(name, (0.5 * k, 2.0 * k, k))
             (wrong,), misled = self._moved(name, (k,), wrong=True)
-            arms = laws_of(name, self.stiffness).configure()
+            arms = laws_of(name, self.stiffness, self.null_stiffness).configure()
             cfg = self.stability.configure(HumanoidEnvConfig(backend="mjbatch", num_threads=self.threads))
             cfg.upper_body = arms
             rows[name] = {
@@ -302,7 +308,7 @@ class Properties:
                 "wrong_over_right_displacement": wrong / right,
                 "wrong_model_shift": float((misled - at).norm()),
                 "linearised": growth_rates(h1(), arms.built(arms.left), self.stability),
-                "energy": energy_summary(exchanged_energy(HumanoidEnv(cfg), self.stability)),
+                "energy": energy_summary(exchanged_energy(HumanoidEnv(cfg), self.stability)[0]),
             }
             print(f"  {name}", file=sys.stderr)
         return {"rows": rows}
@@ -314,7 +320,7 @@ class Properties:
         """
         protocol = StaticStiffness(num_envs=1 + len(stiffness), levels=2, settle_seconds=self.settle_seconds)
         cfg = protocol.configure(HumanoidEnvConfig(backend="mjbatch", num_threads=self.threads))
-        cfg.upper_body = laws_of(name, stiffness[-1]).configure()
+        cfg.upper_body = laws_of(name, stiffness[-1], self.null_stiffness).configure()
         env = HumanoidEnv(cfg)
         if wrong:
             misjudge(env, self.wrong_length, self.wrong_mass)

@@ -15,8 +15,6 @@ from paper_differences import differences
 from paper_page import SHIPPED, Book, fallen, missing, number, ordering, picture, plot_curves, slug, verdict, write
 from paper_tables import ABLATION, IMPACT, LOAD, ROWS
 
-from cotap.graphics import choose_opengl
-
 ARMS = {
     "PD, kp 100": ["--method", "pd"],
     "soft PD, kp 30": ["--method", "soft-pd"],
@@ -217,7 +215,9 @@ def periodic(book: Book) -> None:
         "",
     )
     for policy in POLICIES:
-        result = book.run(f"periodic-{policy}", policy, "periodic-load")
+        result = book.run(
+            f"periodic-{policy}", policy, "periodic-load", "--left", "cotap:alpha=0.7,stiffness=500", "--right", "pd"
+        )
         if result is None:
             book.add(f"Policy `{policy}`: {missing(policy)}.", "")
             continue
@@ -578,7 +578,6 @@ def main() -> int:
     unknown = sorted(set(options.only) - PARTS.keys())
     if unknown:
         parser.error(f"--only {unknown[0]!r} is unknown; parts: {', '.join(PARTS)}")
-    choose_opengl()
     # A part alone is no page to put in the place of the whole one.
     folder = options.out or Path("runs/paper-quick" if options.quick else "runs/paper" if options.only else "docs")
     out = folder / "results"

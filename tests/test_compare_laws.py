@@ -44,7 +44,7 @@ def small(table: str, folder: Path, *options: str) -> dict:
 
 
 def test_static_table(tmp_path, capsys, policy):
-    options = ["--pelvis", "fixed", "--repeats", "1", "--settle-seconds", "2", "--laws", "cotap, task error", "facet"]
+    options = ["--pelvis", "fixed", "--num-envs", "6", "--settle-seconds", "2", "--laws", "cotap, task error", "facet"]
     content = small("static", tmp_path, *policy, *options)
     assert content["rows"]["cotap, task error"]["displacement"] == pytest.approx(content["ideal"], rel=0.05)
     text = (tmp_path / "static.md").read_text()
@@ -65,7 +65,7 @@ def test_transient_table(tmp_path, policy):
 
 def test_properties_table(tmp_path):
     content = small("properties", tmp_path, "--stability.poses", "4", "--stability.num-envs", "2",
-                    "--stability.seconds", "0.2", "--stability.settle-seconds", "0.5", "--settle-seconds", "2",
+                    "--stability.episode-seconds", "0.2", "--stability.settle-seconds", "0.5", "--settle-seconds", "2",
                     "--laws", "facet")  # fmt: skip
     row = content["rows"]["facet"]
     assert 1.5 < row["softer_over_stiffer"] < 4.0  # PD's own compliance is in both

@@ -374,8 +374,9 @@ OPTIONS = {
     "motions": ["import", "show", "good.npz", "nowhere", "--output", "--format", "auto", "amass", "--mirror", "--clip",
                 "--robot", "h1"],
     "export": ["--output", "p.onnx", "nowhere/p.onnx", "--checkpoint", "h1-base", "--checks", "--seed"],
-    "deploy": ["--policy", "good.onnx", "--scenario", "good.toml", "--trials", "--seconds", "--arm-motion", "random",
-               "--left", "cotap:alpha=0.7", "--seed", "--engine", "mujoco", "--timestep", "--delay-steps", "--json"],
+    "deploy": ["--policy", "good.onnx", "--scenario", "good.toml", "--trials", "--episode-seconds", "--arm-motion",
+               "random", "--left", "cotap:alpha=0.7", "--seed", "--engine", "mujoco", "--timestep",
+               "--delay-steps", "--json"],
     "compare": ["good.json", "--without-falls", "--json", "nowhere/o.json"],
     "play": ["--host", "127.0.0.1", "--port", "--checkpoint", "good.pt", "--robot", "h1", "--replay", "--seed"],
 }  # fmt: skip
@@ -454,7 +455,7 @@ hand = "left"
 
 def deploys(args: list[str], named: str, capsys: pytest.CaptureFixture[str]) -> None:
     """A file is used on a robot, or refused with an error that names it."""
-    status = deploy.main([*args, "--seconds", "0.06"])
+    status = deploy.main([*args] if "--scenario" in args else [*args, "--episode-seconds", "0.06"])
     said = capsys.readouterr().err
     assert status in (0, 2)
     assert status == 0 or re.match(f"error: .*({named})", said, re.DOTALL), said

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from cotap.agents.checkpoint import load_checkpoint, sha256
-from cotap.evaluate import evaluate
+from cotap.configs import from_plain
+from cotap.evaluate import PROTOCOLS, evaluate
+from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.policy import load_policy, shipped_checkpoint, shipped_names
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
@@ -32,6 +36,21 @@ def test_a_shipped_policy_is_small_and_says_where_it_comes_from(name: str):
     assert said["command"].startswith("python -m cotap.train")
     assert said["commit"]
     assert said["evaluations"].keys() == EVALUATIONS.keys()
+
+
+@pytest.mark.parametrize("name", shipped_names())
+def test_a_shipped_evaluation_can_be_asked_for_again(name: str):
+    """Its settings are still those of its protocol, and are allowed."""
+    for path in shipped_checkpoint(name).parent.glob(f"{name}.*.json"):
+        kept = json.loads(path.read_text())
+        protocol = from_plain(PROTOCOLS[kept["protocol"]], own(PROTOCOLS[kept["protocol"]], kept["settings"]))
+        protocol.check()
+        LawOptions(**own(LawOptions, kept["settings"])).configure()
+
+
+def own(kind: type, settings: dict[str, Any]) -> dict[str, Any]:
+    """Of all settings, those of one dataclass."""
+    return {f.name: settings[f.name] for f in fields(kind) if f.name in settings}
 
 
 @pytest.mark.parametrize("name", shipped_names())

@@ -35,8 +35,8 @@ class DeployOptions:
     """Commands from this terminal, in real time."""
     trials: int = 1
     """Repeat so often, with other seeds, and sum up."""
-    seconds: float = 20.0
-    """How long a trial lasts; a scenario says so itself [s]."""
+    episode_seconds: float | None = None
+    """How long a trial lasts, by default 20 s; a scenario says so itself [s]."""
     arm_motion: str = ""
     """Clip that the arms follow, or `random`; empty holds the default pose. A scenario says so itself."""
     left: str = ""
@@ -74,6 +74,7 @@ def deploy(options: DeployOptions) -> dict[str, Any]:
     from cotap.deployment.keyboard import HELP, KeyboardPilot, raw_terminal
     from cotap.deployment.policy import OnnxPolicy
     from cotap.deployment.trials import report, run_trials
+    from cotap.evaluation.render import STRIDE, render_frames, require_renderer, write_film
 
     require_positive_int("trials", options.trials)
     require_seed("seed", options.seed)
@@ -83,10 +84,16 @@ def deploy(options: DeployOptions) -> dict[str, Any]:
     require_output("--video", options.video, (".mp4",))
     if options.keyboard and (options.scenario or options.trials > 1):
         raise ValueError("--keyboard goes with neither --scenario nor --trials")
+    if options.scenario and (options.episode_seconds is not None or options.arm_motion):
+        raise ValueError("--episode-seconds and --arm-motion do nothing with --scenario: it gives them itself")
+    if options.video:
+        require_renderer()
     policy = OnnxPolicy(options.policy)
     spec = robot_of(policy.metadata)
-    scenario = load_scenario(options.scenario, spec) if options.scenario else Scenario(options.seconds)
+    scenario = load_scenario(options.scenario, spec) if options.scenario else Scenario()
     if not options.scenario:
+        if options.episode_seconds is not None:
+            scenario.seconds = options.episode_seconds
         scenario.arms.clip = options.arm_motion
         scenario.check(spec)
     laws = law_config(policy.metadata)
@@ -117,11 +124,8 @@ def deploy(options: DeployOptions) -> dict[str, Any]:
         import numpy as np
         import torch
 
-        from cotap.evaluation.render import render_frames, write_video
-
-        stride = 2
-        frames = render_frames(spec, torch.from_numpy(np.stack(trials[0].qpos[::stride])))
-        write_video(Path(options.video), frames, 1.0 / (trials[0].dt * stride))
+        part = torch.from_numpy(np.stack(trials[0].qpos[::STRIDE]))
+        write_film(Path(options.video), render_frames(spec, part), len(part), trials[0].dt)
     return result
 
 

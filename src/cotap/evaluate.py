@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import sys
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from cotap.envs import HumanoidEnv
+    from cotap.envs.upper_body import UpperBodyConfig
     from cotap.evaluation.policy import Policy
 
 P = TypeVar("P", bound=Protocol)
@@ -69,12 +71,6 @@ class Options(Generic[P]):
     """Write the result here."""
     plot: str = ""
     """Write a plot here (PNG)."""
-
-
-@dataclass
-class RolloutOptions(Options[P]):
-    """What evaluations take that can be filmed."""
-
     video: str = ""
     """Write a video of the first env here (MP4), of a tour of commands for velocity-tracking; a contact sheet
     (NAME_frames.png) goes beside it."""
@@ -82,7 +78,7 @@ class RolloutOptions(Options[P]):
 
 @dataclass
 class RecordingOptions:
-    """A recording of `cotap.play`: the same measures, robot by robot."""
+    """A recording of `cotap.play`, measured robot by robot; nothing is simulated."""
 
     protocol: tyro.conf.OmitArgPrefixes[RecordingProtocol]
     json: str = ""
@@ -93,7 +89,7 @@ def main(argv: list[str] | None = None) -> int:
     """Parse, evaluate, report. Returns the exit status: 0, or 2 for bad input."""
     args = list(sys.argv[1:] if argv is None else argv)
     if not args or args[0] in ("-h", "--help"):
-        print(f"usage: python -m cotap.evaluate PROTOCOL [options]; protocols: {', '.join((*PROTOCOLS, RECORDING))}")
+        print(usage())
         return 0 if args else 2
     try:
         evaluate(args)
@@ -101,6 +97,16 @@ def main(argv: list[str] | None = None) -> int:
         print(f"error: {shortened(str(error))}", file=sys.stderr)
         return 2
     return 0
+
+
+def usage() -> str:
+    """How the command is called, and what every protocol is for."""
+    lines = []
+    for name, kind in {**PROTOCOLS, RECORDING: RecordingProtocol}.items():
+        purpose, *_ = (inspect.getdoc(kind) or "").split("\n\n")
+        lines.append(f"  {name:18s}{' '.join(purpose.split())}")
+    call = "python -m cotap.evaluate PROTOCOL"
+    return "\n".join([f"usage: {call} [options]", "", "protocols:", *lines, "", f"Options: {call} --help"])
 
 
 def evaluate(args: list[str]) -> dict[str, Any]:
@@ -118,8 +124,8 @@ def evaluate(args: list[str]) -> dict[str, Any]:
 def parse(args: list[str]) -> Options[Protocol]:
     """The options that a command line means. Raises ValueError for an unknown protocol."""
     kind = PROTOCOLS[require_one_of("protocol", args[0], (*PROTOCOLS, RECORDING))]
-    options: Any = RolloutOptions if issubclass(kind, RolloutProtocol) else Options
-    default, prog = options(kind(), replace(kind.laws)), f"python -m cotap.evaluate {args[0]}"
+    default, prog = Options(kind(), LawOptions()), f"python -m cotap.evaluate {args[0]}"
+    options: Any = Options
     return tyro.cli(options[kind], args=args[1:], default=default, prog=prog, description=kind.__doc__)
 
 
@@ -130,20 +136,23 @@ def prepare(options: Options[Protocol]) -> tuple[HumanoidEnv, Policy, str]:
     from cotap.agents.checkpoint import require_layout, sha256
     from cotap.envs import HumanoidEnv
     from cotap.evaluation.policy import load_policy
+    from cotap.evaluation.render import require_renderer
     from cotap.sim import resolve_backend
 
     protocol = options.protocol
     protocol.check()
-    options.laws.configure()
+    options.laws.require_free(protocol.drives)
     require_range("threads", options.threads, 0, 4096)
-    require_outputs(options.json, options.plot, getattr(options, "video", ""))
+    require_outputs(options.json, options.plot, options.video)
+    if options.video:
+        require_renderer()
     if options.threads:
         torch.set_num_threads(options.threads)
     path = _checkpoint(options)
     policy = load_policy(path)
     torch.manual_seed(protocol.seed)
     cfg = policy.env_config
-    cfg.upper_body, cfg.num_threads = options.laws.configure(cfg.upper_body), options.threads
+    cfg.upper_body, cfg.num_threads = arms_of(options, policy), options.threads
     cfg.backend = resolve_backend(options.backend)
     env = HumanoidEnv(protocol.configure(cfg))
     require_layout(path, policy.layout, json.loads(json.dumps(env.layout())))
@@ -151,9 +160,22 @@ def prepare(options: Options[Protocol]) -> tuple[HumanoidEnv, Policy, str]:
     return env, policy.to(env.device), sha256(path)
 
 
+def arms_of(options: Options[Protocol], policy: Policy) -> UpperBodyConfig:
+    """The laws of the arms: those of the options, else those that the policy was trained with, else the protocol's.
+
+    Raises:
+        ValueError: an option of the laws is out of its range, or neither arm's law reads it.
+    """
+    trained = policy.env_config.upper_body
+    under_pd = policy.stage == "base" and trained.left.name == trained.right.name == "pd"
+    if under_pd and options.laws.method is None:
+        trained = options.protocol.laws.configure(trained)
+    return options.laws.configure(trained)
+
+
 def run(name: str, options: Options[Protocol]) -> dict[str, Any]:
     """Evaluate, print the table, write what was asked for, and return the result."""
-    protocol, video = options.protocol, getattr(options, "video", "")
+    protocol = options.protocol
     env, policy, digest = prepare(options)
     start = time.perf_counter()
     measured = protocol.evaluate(env, policy)
@@ -171,8 +193,8 @@ def run(name: str, options: Options[Protocol]) -> dict[str, Any]:
     _report(protocol.table(result), result, options.json)
     if options.plot:
         protocol.plot(Path(options.plot), result)
-    if video and isinstance(protocol, RolloutProtocol):
-        protocol.video(Path(video), sheet_path(video), env, policy)
+    if options.video:
+        protocol.video(Path(options.video), sheet_path(options.video), env, policy)
     return result
 
 

@@ -342,7 +342,7 @@ def test_every_robot_is_deployed(robot, engine, random_policy, tmp_path):
         str(random_policy(robot=robot)),
         "--engine",
         engine,
-        "--seconds",
+        "--episode-seconds",
         "0.2",
         "--json",
         str(out),
@@ -421,7 +421,7 @@ def _edited(policy_file, tmp_path, name, value):
     ],
 )
 def test_policies_of_another_robot_are_refused(name, value, message, policy_file, tmp_path, capsys):
-    assert deploy(["--policy", str(_edited(policy_file, tmp_path, name, value)), "--seconds", "0.1"]) == 2
+    assert deploy(["--policy", str(_edited(policy_file, tmp_path, name, value)), "--episode-seconds", "0.1"]) == 2
     assert message in capsys.readouterr().err
 
 

@@ -127,7 +127,7 @@ def test_a_small_comparison_is_written_whole(shipped_file, tmp_path, monkeypatch
     monkeypatch.setattr(sim_to_sim, "LAWS", {"PD": "pd"})
     monkeypatch.setattr(sim_to_sim, "PERTURBATIONS", {"late": Perturbations(delay_steps=(1, 1))})
     arguments = ["--policy", str(shipped_file), "--engines", "mujoco", "--trials", "1", "--perturbed-trials", "1",
-                 "--load-trials", "1", "--seconds", "2", "--timestep", "0.01", "--jobs", "1", "--output",
+                 "--load-trials", "1", "--episode-seconds", "2", "--timestep", "0.01", "--jobs", "1", "--output",
                  str(tmp_path)]  # fmt: skip
     assert script.main(arguments) == 0
     result = json.loads((tmp_path / "report.json").read_text())
@@ -162,7 +162,7 @@ def test_bad_comparisons_are_named(policy_file, script, capsys, tmp_path):
     for arguments, message in (
         (["--engines", "newton"], "engine 'newton' is unknown"),
         (["--trials", "0"], "trials must be a positive integer"),
-        (["--seconds", "1"], "seconds must lie in"),
+        (["--episode-seconds", "1"], "episode_seconds must lie in"),
         (["--jobs", "-1"], "jobs must lie in"),
     ):
         assert script.main(["--policy", str(policy_file), "--output", str(tmp_path), *arguments]) == 2

@@ -115,11 +115,45 @@ def test_the_video_is_of_the_laws_that_were_asked_for(
     tmp_path: Path, checkpoint: Path, monkeypatch: pytest.MonkeyPatch
 ):
     filmed = []
+    monkeypatch.setattr("cotap.evaluation.render.require_renderer", lambda: None)
     monkeypatch.setattr("cotap.evaluation.render.tour_video", lambda _path, cfg, *_: filmed.append(cfg.upper_body))
     options = ("--num-envs", "2", "--episode-seconds", "5", "--method", "cotap", "--singularity-ratio", "False")
     result = run(tmp_path, checkpoint, *options, "--video", str(tmp_path / "tour.mp4"))
     assert to_plain(filmed[0]) == result["settings"]["env"]["upper_body"]
     assert not filmed[0].singularity_ratio
+
+
+@pytest.mark.parametrize("protocol", ["velocity-tracking", "static-stiffness", "stability"])
+def test_that_there_is_no_renderer_is_found_before_the_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, protocol: str
+):
+    import mujoco
+
+    def broken(*_: object) -> None:
+        raise RuntimeError("no GL")
+
+    monkeypatch.setattr(mujoco, "Renderer", broken)
+    monkeypatch.setattr("cotap.envs.HumanoidEnv", None)  # the work must not begin
+    assert main([protocol, "--video", str(tmp_path / "film.mp4")]) == 2
+    assert "cannot render here (no GL)" in capsys.readouterr().err
+
+
+def test_a_held_load_is_filmed_from_its_start(tmp_path: Path, checkpoint: Path, monkeypatch: pytest.MonkeyPatch):
+    filmed = []
+    monkeypatch.setattr("cotap.evaluation.render.require_renderer", lambda: None)
+    monkeypatch.setattr("cotap.evaluation.render.film_video", lambda _path, _env, film, _sheet: filmed.append(film))
+    held = ["--num-envs", "2", "--settle-seconds", "2", "--threads", "1"]
+    options = {
+        "static-stiffness": [*held, "--levels", "2"],
+        "fidelity": [*held, "--pelvis", "fixed", "--stiffness-values", "300"],
+        "stability": ["--poses", "2", "--num-envs", "2", "--settle-seconds", "2", "--episode-seconds", "2"],
+    }
+    for protocol, own in options.items():
+        arguments = [protocol, *own, "--checkpoint", str(checkpoint), "--video", str(tmp_path / "film.mp4")]
+        evaluate(arguments)
+    assert [len(film) for film in filmed] == [200, 200, 200]
+    width = len(h1().joints) + 7 + 12
+    assert {film.shape[1] for film in filmed} == {width}
 
 
 def test_without_a_renderer_the_message_says_what_to_do(monkeypatch: pytest.MonkeyPatch):

@@ -12,8 +12,8 @@ from cotap.evaluate import evaluate
 COMPLIANT = ["--method", "cotap", "--num-envs", "2", "--threads", "1"]
 PROTOCOLS = {
     "velocity-tracking": ["--num-envs", "2", "--threads", "1", "--episode-seconds", "5.0"],
-    "fidelity": ["--threads", "1", "--num-envs", "3", "--stiffness-levels", "200.0", "--settle-seconds", "2.0"],
-    "stability": ["--method", "facet", "--threads", "1", "--poses", "2", "--num-envs", "2", "--seconds", "0.2",
+    "fidelity": ["--threads", "1", "--num-envs", "3", "--stiffness-values", "200.0", "--settle-seconds", "2.0"],
+    "stability": ["--method", "facet", "--threads", "1", "--poses", "2", "--num-envs", "2", "--episode-seconds", "0.2",
                   "--settle-seconds", "0.2", "--change-seconds", "0.1"],
     "static-stiffness": ["--method", "cotap", "--threads", "1", "--num-envs", "2",
                          "--levels", "2", "--settle-seconds", "2.0"],

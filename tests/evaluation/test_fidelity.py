@@ -28,7 +28,7 @@ def result(**changes: torch.Tensor) -> FidelityResult:
 
 def test_errors_by_hand():
     """Twice too stiff along y; who falls or could not hold the load does not count."""
-    out = summary(result(), 0.8, Fidelity(stiffness_levels=(200.0,)))
+    out = summary(result(), 0.8, Fidelity(stiffness_values=(200.0,)))
     assert [row["error"] for row in out["fidelity"]] == pytest.approx([0.0, 1.0, 0.0])
     assert [row["n"] for row in out["fidelity"]] == [2, 2, 1]
     assert out["largest_error"] == pytest.approx(1.0)
@@ -37,7 +37,7 @@ def test_errors_by_hand():
     assert out["num_wrong_way"] == 0
     assert out["error_quantiles"] == {"50": 0.0, "95": pytest.approx(1.0)}
     out = summary(result(unholdable=torch.tensor([False, False, True, True, False, False])), 0.8,
-                  Fidelity(stiffness_levels=(200.0,)))  # fmt: skip
+                  Fidelity(stiffness_values=(200.0,)))  # fmt: skip
     assert out["fidelity"][1]["error"] is None
     assert out["fidelity"][1]["reason"] == "no env was counted"
     assert out["largest_error"] == 0.0  # of what was measured
@@ -49,7 +49,7 @@ def test_errors_by_hand():
 def test_hands_that_go_against_the_load_are_counted_and_shown(tmp_path):
     """One of two hands along x goes the wrong way, both along y do not move on the mean, z is as it was."""
     way = torch.tensor([1.5, -0.5, 0.5, -0.5, 1.0, 9.0])
-    out = summary(result(way=way), 0.8, Fidelity(stiffness_levels=(200.0,)))
+    out = summary(result(way=way), 0.8, Fidelity(stiffness_values=(200.0,)))
     assert out["num_wrong_way"] == 2
     assert [row["wrong_way"] for row in out["fidelity"]] == [1, 1, 0]
     assert [row["error"] for row in out["fidelity"]][:2] == [None, None]
@@ -89,7 +89,7 @@ def test_condition_numbers_are_those_of_mujocos_jacobian(model, spec):
 
 @pytest.mark.parametrize(("error", "allowed"), [("joint", 0.12), ("task", 0.02)])
 def test_arms_alone_are_as_stiff_as_they_are_asked_to_be(error, allowed):
-    protocol = Fidelity(num_envs=6, stiffness_levels=(300.0,), displacement=0.01, pelvis="fixed")
+    protocol = Fidelity(num_envs=6, stiffness_values=(300.0,), displacement=0.01, pelvis="fixed")
     cfg = protocol.configure(HumanoidEnvConfig(num_threads=1))
     cfg.upper_body = LawOptions(method="cotap", error=error).configure()
     env = HumanoidEnv(cfg)
@@ -104,7 +104,7 @@ def test_arms_alone_are_as_stiff_as_they_are_asked_to_be(error, allowed):
     ("options", "message"),
     [(["--displacement", "0.2"], "displacement"), (["--num-envs", "0"], "num_envs"),
      (["--method", "pd"], "fidelity needs"),
-     (["--library", "nowhere.npz"], "nowhere.npz"), (["--stiffness-levels", "0"], "stiffness_levels[0]"),
+     (["--library", "nowhere.npz"], "nowhere.npz"), (["--stiffness-values", "0"], "stiffness_values[0]"),
      (["--hand", "both"], "hand 'both' is unknown"), (["--condition", "1.0"], "no pose")],
 )  # fmt: skip
 def test_bad_options_are_named(options, message, capsys, shipped):  # noqa: ARG001

@@ -97,10 +97,10 @@ def test_rates_are_counted_per_wall_and_load(spec):
 
 
 def drawn(name: str) -> dict:
-    protocol = Stability(num_envs=6, seconds=1.5, settle_seconds=4.0, frequency=(1.0, 4.0))
+    protocol = Stability(num_envs=6, episode_seconds=1.5, settle_seconds=4.0, frequency=(1.0, 4.0))
     cfg = protocol.configure(HumanoidEnvConfig(num_threads=1))
     cfg.upper_body = UpperBodyConfig(LawConfig(name), LawConfig(name))
-    return energy_summary(exchanged_energy(HumanoidEnv(cfg), protocol))
+    return energy_summary(exchanged_energy(HumanoidEnv(cfg), protocol)[0])
 
 
 def test_energy_is_drawn_from_what_is_active_and_from_nothing_else(monkeypatch):
@@ -124,7 +124,7 @@ def test_energy_accounts():
 
 def test_the_command_prints_and_writes(checkpoint, tmp_path, capsys):
     out = tmp_path / "stability.json"
-    arguments = ["--method", "cotap+facet-matched", "--poses", "4", "--num-envs", "2", "--seconds", "0.2",
+    arguments = ["--method", "cotap+facet-matched", "--poses", "4", "--num-envs", "2", "--episode-seconds", "0.2",
                  "--settle-seconds", "0.2", "--threads", "1", "--json", str(out),
                  "--plot", str(tmp_path / "stability.png")]  # fmt: skip
     assert main(["stability", "--checkpoint", str(checkpoint), *arguments]) == 0
@@ -139,7 +139,7 @@ def test_without_the_ratio_both_halves_are_without_it(spec, checkpoint, tmp_path
     """Poses beyond a condition number of 2 are most: the ratio and its absence make different loops."""
     law = "cotap:condition_threshold=2"
     arguments = ["--left", law, "--right", law, "--singularity-ratio", "False", "--poses", "8", "--num-envs",
-                 "2", "--seconds", "0.1", "--settle-seconds", "0.1", "--threads", "1", "--json"]  # fmt: skip
+                 "2", "--episode-seconds", "0.1", "--settle-seconds", "0.1", "--threads", "1", "--json"]  # fmt: skip
     assert main(["stability", "--checkpoint", str(checkpoint), *arguments, str(tmp_path / "out.json")]) == 0
     content = json.loads((tmp_path / "out.json").read_text())
     left = LawConfig("cotap", condition_threshold=2.0)

@@ -136,12 +136,10 @@ def test_arms_of_any_robot_give_way_to_a_load(robot):
 
 
 def test_arms_have_laws_of_their_own():
-    options = LawOptions(
-        method="cotap", stiffness=(300.0,), alpha=0.9, right="pd", left="cotap:alpha=0.5,stiffness=1x2x3"
-    )
+    options = LawOptions(method="hmc", stiffness=(300.0,), alpha=0.9, left="cotap:alpha=0.5,stiffness=1x2x3")
     cfg = options.configure()
     assert (cfg.left.name, cfg.left.alpha, cfg.left.stiffness) == ("cotap", 0.5, (1.0, 2.0, 3.0))
-    assert (cfg.right.name, cfg.right.alpha) == ("pd", 0.9)
+    assert (cfg.right.name, cfg.right.alpha, cfg.right.stiffness) == ("hmc", 0.9, (300.0,) * 3)
     assert parse_law("left", "soft-pd:soft-gain=20", cfg.left).soft_gain == 20.0
     facet = parse_law("left", "facet:sensing=estimated,virtual-mass=2", cfg.left)
     assert (facet.name, facet.sensing, facet.virtual_mass, facet.stiffness) == (

@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from cotap.compliance.laws import reads
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.rollout import idle
@@ -56,8 +57,8 @@ def predicted(law: str, env: HumanoidEnv) -> np.ndarray:
 def test_static_displacement_is_what_the_springs_add_up_to(law):
     protocol = StaticStiffness(num_envs=2, force=LOAD, levels=2, settle_seconds=2.0, arm_pose=(0.0, 0.0, 0.0, 0.3))
     cfg = protocol.configure(HumanoidEnvConfig(num_threads=1))
-    alpha = WEIGHT if law == "hmc" else 1.0
-    cfg.upper_body = LawOptions(law, tuple(STIFFNESS.tolist()), alpha=alpha).configure()
+    stiffness = tuple(STIFFNESS.tolist()) if reads(law, "stiffness") else None
+    cfg.upper_body = LawOptions(law, stiffness, alpha=WEIGHT if law == "hmc" else None).configure()
     env = HumanoidEnv(cfg)
     protocol.prepare(env)
     moved = measure(env, protocol, idle(env)).displacement[-1].numpy()

@@ -188,6 +188,26 @@ LAWS: dict[str, Callable[[Arms, LawConfig], UpperBodyLaw]] = {
 }
 """Every law, by name."""
 
+_OF_COTAP = ("stiffness", "null_stiffness", "alpha", "condition_threshold", "error", "damping")
+_OF_A_MASS = ("virtual_mass", "damping_ratio")
+READS: dict[str, tuple[str, ...]] = {
+    "pd": (),
+    "soft-pd": ("soft_gain",),
+    "cotap": _OF_COTAP,
+    "facet": ("stiffness", *_OF_A_MASS, "sensing"),
+    "cotap+facet": (*_OF_COTAP, *_OF_A_MASS, "sensing"),
+    "cotap+facet-matched": (*_OF_COTAP, *_OF_A_MASS, "sensing", "reference_share"),
+    "hmc": ("stiffness", "alpha", *_OF_A_MASS),
+    "dcc": ("stiffness", "sensing"),
+}
+"""The fields of its `LawConfig` that each law reads; the others do nothing under it."""
+
+
+def reads(law: str, field: str) -> bool:
+    """Whether a law, by name, reads a field of its `LawConfig`; one that `READS` does not know may read all."""
+    return field in READS.get(law, (field,))
+
+
 WITHOUT_STIFFNESS = ("pd", "soft-pd")
 """Laws that command no stiffness of the hand."""
 

@@ -73,7 +73,7 @@ class Comparison:
     """Trials of each perturbation."""
     load_trials: int = 4
     """Trials of each law under each load."""
-    seconds: float = 20.0
+    episode_seconds: float = 20.0
     """Length of a trial of velocity tracking or under perturbations [s]."""
     seed: int = 0
     """Seed of all of it."""
@@ -84,7 +84,7 @@ class Comparison:
         """Raise ValueError naming the first field that is out of its range."""
         for name in ("trials", "perturbed_trials", "load_trials"):
             require_positive_int(name, getattr(self, name))
-        require_range("seconds", self.seconds, 2.0, 3600.0)
+        require_range("episode_seconds", self.episode_seconds, 2.0, 3600.0)
         if not self.engines:
             raise ValueError("engines must name at least one engine")
         for name in self.engines:
@@ -134,12 +134,12 @@ def _parts(policy: OnnxPolicy, cfg: Comparison, run: Run) -> dict[str, Callable[
     impact, load = Impact(onset=ONSET_S, episode_seconds=ONSET_S + 2.0), ConstantLoad(onset=ONSET_S)
     load.episode_seconds = ONSET_S + 4.0
     return {
-        "velocity-tracking": lambda: tracking(run(Scenario(cfg.seconds), cfg.trials), policy, cfg),
+        "velocity-tracking": lambda: tracking(run(Scenario(cfg.episode_seconds), cfg.trials), policy, cfg),
         "impact": lambda: loads(run, spec, impact, cfg),
         "constant-load": lambda: loads(run, spec, load, cfg),
         "periodic-load": lambda: periodic(run, spec, cfg),
         "perturbations": lambda: {
-            label: falls(run(Scenario(cfg.seconds), cfg.perturbed_trials, wrong=wrong))
+            label: falls(run(Scenario(cfg.episode_seconds), cfg.perturbed_trials, wrong=wrong))
             for label, wrong in PERTURBATIONS.items()
         },
     }
@@ -168,7 +168,7 @@ def falls(trials: list[Trial]) -> dict[str, Any]:
 
 def tracking(trials: list[Trial], policy: OnnxPolicy, cfg: Comparison) -> dict[str, Any]:
     """Falls and tracking errors."""
-    measures = tracking_measures(_trajectory(trials, cfg.seconds), gait_config(policy.metadata).period_s)
+    measures = tracking_measures(_trajectory(trials, cfg.episode_seconds), gait_config(policy.metadata).period_s)
     names = ("e_lin", "e_lin_gait", "e_yaw_gait", "e_height", "e_upper", "stand_drift", "swing_height")
     return falls(trials) | {"metrics": {name: summarize(measures[name], cfg.seed) for name in names}}
 
@@ -179,7 +179,7 @@ def loads(run: Run, spec: RobotSpec, protocol: Impact, cfg: Comparison) -> dict[
     force = ForceProfile(protocol.force, protocol.hand, protocol.onset, protocol.duration)
     scenario = Scenario(protocol.seconds, command=STAND, force=(force,))
     for label, text in LAWS.items():
-        law = parse_law("left", text, LawConfig(null_stiffness=25.0))
+        law = parse_law("left", text, LawConfig())
         trials = run(scenario, cfg.load_trials, UpperBodyConfig(law, replace(law)), Perturbations(start_error=0.02))
         t = _trajectory(trials, protocol.seconds)
         begin, first, last = (round((protocol.onset + s) / t.dt) for s in (0.0, *protocol.window))

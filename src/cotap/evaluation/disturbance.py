@@ -64,6 +64,8 @@ class Impact(Scenario):
         require_range("fall_seconds", self.fall_seconds, 0.02, 3600.0)
         require_range("episode_seconds", self.episode_seconds, self.onset + max(self.window[1], self.fall_seconds), 1e4)
         self._profile().check()
+        if self.place == "base":
+            self.require_default("hand", "for a force on the base")
 
     def _profile(self) -> ForceProfile:
         return ForceProfile(self.force, self.hand, self.onset, self.duration, 0.0, self.random_direction, self.place)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -35,10 +35,11 @@ class Fidelity(HeldLoad):
     """
 
     laws: ClassVar[LawOptions] = LawOptions(method="cotap")
+    drives: ClassVar[dict[str, str]] = {"stiffness": "--stiffness-values"}
 
     num_envs: int = 192
     """Number of envs, dealt to stiffnesses, axes and poses: with 4 stiffnesses 12 envs a pose."""
-    stiffness_levels: tuple[float, ...] = (100.0, 200.0, 400.0, 800.0)
+    stiffness_values: tuple[float, ...] = (100.0, 200.0, 400.0, 800.0)
     """Hand stiffnesses, on all axes [N/m]; they take the place of `--stiffness`."""
     displacement: float = 0.02
     """How far the load should move the hand, at most 0.05 [m]."""
@@ -47,7 +48,7 @@ class Fidelity(HeldLoad):
     library: str = ""
     """Motion library (.npz) that poses are drawn from; empty takes the one that comes with the package."""
     pelvis: str = "free"
-    """free: standing, under the policy. fixed: held in the air, no policy."""
+    """free: on its legs, under the policy. fixed: held in the air, without a policy."""
     upper_actions: str = "policy"
     """What moves the arms (pelvis free): policy, or reference for the raw reference instead of its upper actions."""
     settle_seconds: float = 6.0
@@ -56,16 +57,17 @@ class Fidelity(HeldLoad):
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
         super().check()
-        if not self.stiffness_levels:
-            raise ValueError("stiffness_levels must not be empty")
-        for i, value in enumerate(self.stiffness_levels):
-            require_range(f"stiffness_levels[{i}]", value, 1.0, 1e5)
+        if not self.stiffness_values:
+            raise ValueError("stiffness_values must not be empty")
+        for i, value in enumerate(self.stiffness_values):
+            require_range(f"stiffness_values[{i}]", value, 1.0, 1e5)
         require_range("displacement", self.displacement, 1e-4, 0.05)
         require_range("condition", self.condition, 1.0, 1e3)
 
     def evaluate(self, env: HumanoidEnv, policy: PolicyFunction) -> dict[str, Any]:
         """Run. Returns the measured part of the JSON."""
         measured, coverage = measure(env, self, policy)
+        self.film = measured.film
         falls = int(measured.fell.sum())
         return {"num_falls": falls, **summary(measured, coverage, self), "window": self.window}
 
@@ -94,6 +96,8 @@ class FidelityResult:
     """(W,) bool: the load asks for more torque than the arm is trusted with; left out."""
     saturated: torch.Tensor
     """(W,) bool: an arm joint was at its torque limit at the end."""
+    film: torch.Tensor = field(default_factory=lambda: torch.zeros(0, 0))
+    """Of the first env, as `Trajectory` has it."""
 
     @property
     def counted(self) -> torch.Tensor:
@@ -124,7 +128,7 @@ def measure(env: HumanoidEnv, protocol: Fidelity, policy: PolicyFunction) -> tup
     if not good.any():
         raise ValueError(f"condition {protocol.condition}: no pose of the motion library has one that low")
     rng = torch.Generator().manual_seed(protocol.seed)
-    levels, index = torch.tensor(protocol.stiffness_levels), torch.arange(env.num_envs)
+    levels, index = torch.tensor(protocol.stiffness_values), torch.arange(env.num_envs)
     stiffness, axis, number = levels[index % len(levels)], index // len(levels) % 3, index // (3 * len(levels))
     pose = frames[good][torch.randint(0, int(good.sum()), (int(number[-1]) + 1,), generator=rng)][number]
     direction = torch.nn.functional.one_hot(axis, 3) * (2.0 * torch.randint(0, 2, (len(axis), 1), generator=rng) - 1.0)
@@ -135,7 +139,7 @@ def measure(env: HumanoidEnv, protocol: Fidelity, policy: PolicyFunction) -> tup
     unholdable = _torque_share(env, pose, side, force_h) > HOLDABLE
     settled = settle(env, acting(env, policy, protocol.upper_actions), protocol.settle_seconds, side)
     way = (settled.moved * direction).sum(1) / protocol.displacement
-    result = FidelityResult(axis, stiffness, way, settled.fell, unholdable, settled.saturated)
+    result = FidelityResult(axis, stiffness, way, settled.fell, unholdable, settled.saturated, settled.film)
     return result, float(good.float().mean())
 
 
@@ -157,7 +161,7 @@ def summary(result: FidelityResult, coverage: float, protocol: Fidelity) -> dict
     """
     rows = []
     for axis, name in enumerate("xyz"):
-        for level in protocol.stiffness_levels:
+        for level in protocol.stiffness_values:
             mine = result.counted & (result.axis == axis) & (result.stiffness == level)
             rows.append({"axis": name, "stiffness": level, **_error(result.way[mine], protocol.seed)})
     way = result.way[result.counted]

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 
 from cotap.checks import quoted, require_one_of, require_range
-from cotap.compliance.laws import LAWS, LawConfig
+from cotap.compliance.laws import LAWS, READS, LawConfig, reads
 from cotap.envs.upper_body import LawSampling, UpperBodyConfig
+
+SIDES = ("left", "right")
+OF_ALL_ARMS = {"torso_compliance": "stiffness", "singularity_ratio": "condition_threshold"}
+"""Options that CoTaP's laws alone read, though they are of no single arm, with a field that they come with."""
 
 
 @dataclass
 class LawOptions:
-    """Laws of the arms. What is not given is as the policy was trained, or for another law as the law has it."""
+    """Laws of the arms. What is not given is as the policy was trained, or for another law as the law has it. A
+    policy that was trained under PD has the protocol's own law, if it has one."""
 
     method: str | None = None
     """Upper-body law of both arms: pd, soft-pd, cotap, facet, cotap+facet, cotap+facet-matched, hmc or dcc."""
@@ -44,16 +50,48 @@ class LawOptions:
     """Whether to go back to PD near singular arms (paper, equation 9)."""
 
     def configure(self, trained: UpperBodyConfig | None = None) -> UpperBodyConfig:
-        """The config of the arms, for a policy that was trained with `trained`. Raises ValueError for bad options."""
+        """The config of the arms, for a policy that was trained with `trained`.
+
+        Raises:
+            ValueError: an option is out of its range, or neither arm's law reads it.
+        """
         out = copy.deepcopy(trained or UpperBodyConfig())
-        out.left, out.right = (self._law(side, out.of(side)) for side in ("left", "right"))
+        out.left, out.right = (self._law(side, out.of(side)) for side in SIDES)
         out.sampling = LawSampling()
         if self.torso_compliance is not None:
             out.torso.model = self.torso_compliance
         if self.singularity_ratio is not None:
             out.singularity_ratio = self.singularity_ratio
         out.check()
+        self._require_read({side: out.of(side).name for side in SIDES})
         return out
+
+    def given(self) -> list[str]:
+        """Names of the options that were given, `left` and `right` aside."""
+        return [f.name for f in fields(self) if f.name not in SIDES and getattr(self, f.name) is not None]
+
+    def require_free(self, driven: Mapping[str, str]) -> None:
+        """Raise ValueError if a field of laws is given that a protocol sets itself, by the option in `driven`."""
+        for name, option in driven.items():
+            if name in (*self.given(), *_assigned(self.left), *_assigned(self.right)):
+                raise ValueError(f"{_flag(name)} does nothing here: the protocol sets it, see {option}")
+
+    def _require_read(self, laws: dict[str, str]) -> None:
+        """Raise ValueError for the first option that does nothing under these laws, by side."""
+        if self.method is not None and self.left and self.right:
+            raise ValueError("--method does nothing beside --left and --right: they name both arms' laws")
+        for name in self.given():
+            field = OF_ALL_ARMS.get(name, name)
+            readers = [side for side, law in laws.items() if reads(law, field)]
+            if name == "method" or any(name not in _assigned(getattr(self, side)) for side in readers):
+                continue
+            if readers:
+                raise ValueError(f"{_flag(name)} does nothing: --left and --right give it themselves")
+            named, known = " and ".join(sorted(set(laws.values()))), [law for law in READS if reads(law, field)]
+            raise ValueError(
+                f"{_flag(name)} is not read by {named}, the law here; laws that read it: {', '.join(known)}. Take one "
+                "with --method"
+            )
 
     def _law(self, side: str, trained: LawConfig) -> LawConfig:
         name, text = self.method or trained.name, getattr(self, side)
@@ -68,15 +106,17 @@ def parse_law(option: str, text: str, common: LawConfig) -> LawConfig:
     """`NAME:field=value,...` on top of `common`; several numbers are joined by `x`, as in stiffness=500x500x300.
 
     Raises:
-        ValueError: a law, a field or a number is not known; the message names it.
+        ValueError: a law, a field or a number is not known, or the law does not read the field; the message names it.
     """
     name, _, rest = text.partition(":")
     law = replace(common, name=require_one_of(f"--{option}", name, LAWS.keys()))
     known = {f.name: f.type for f in fields(LawConfig) if f.name != "name"}
     for part in filter(None, rest.split(",")):
-        key, equals, value = part.partition("=")
-        key = key.strip().replace("-", "_")
+        _, equals, value = part.partition("=")
+        key = _key(part)
         require_one_of(f"--{option} field", key, known.keys())
+        if not reads(name, key):
+            raise ValueError(f"--{option}: {name} does not read {key}; it reads: {', '.join(READS[name]) or 'nothing'}")
         if not equals:
             raise ValueError(f"--{option}: {key} needs a value, as in {key}=...")
         if known[key] == "str":
@@ -88,6 +128,20 @@ def parse_law(option: str, text: str, common: LawConfig) -> LawConfig:
             raise ValueError(f"--{option}: {key} must be a number, got {quoted(value)}") from error
         law = replace(law, **{key: _three(numbers) if key == "stiffness" else _one(option, key, numbers)})
     return law
+
+
+def _flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
+def _key(part: str) -> str:
+    """The field that `field=value` is about."""
+    return part.partition("=")[0].strip().replace("-", "_")
+
+
+def _assigned(text: str) -> set[str]:
+    """The fields that a law's text gives."""
+    return {_key(part) for part in text.partition(":")[2].split(",")}
 
 
 def _one(option: str, key: str, numbers: tuple[float, ...]) -> float:

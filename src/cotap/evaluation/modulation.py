@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import torch
 
 from cotap.checks import require_interval, require_one_of, require_range
-from cotap.compliance.laws import WITHOUT_STIFFNESS
+from cotap.compliance.laws import WITHOUT_STIFFNESS, reads
 from cotap.envs import HumanoidEnv
 from cotap.evaluation.disturbance import ConstantLoad, window_measures
 from cotap.evaluation.law_options import LawOptions
@@ -25,6 +25,7 @@ class Modulation(ConstantLoad):
     energy."""
 
     laws: ClassVar[LawOptions] = LawOptions(method="cotap")
+    drives: ClassVar[dict[str, str]] = {"stiffness": "--stiffness-range", "alpha": "--alpha-range"}
 
     change: str = "both"
     """step: from one end to the other at once. ramp: there and back evenly. both: every other env each."""
@@ -61,6 +62,8 @@ class Modulation(ConstantLoad):
         laws = [env.cfg.upper_body.of(arm.side).name for arm in env.spec.arms]
         if all(law in WITHOUT_STIFFNESS for law in laws):
             raise ValueError(f"modulation needs a law with a stiffness, such as --method cotap; got {', '.join(laws)}")
+        if not any(reads(law, "alpha") for law in laws):
+            self.require_default("alpha_range", f"under {', '.join(laws)}")
         rng = torch.Generator().manual_seed(self.seed)
         self.phase = torch.rand(env.num_envs, len(env.spec.arms), 2, generator=rng).to(env.device)
 

@@ -25,7 +25,7 @@ from cotap.robots import RobotSpec
 class PeriodicLoad(Scenario):
     """A load on both hands that swings, 30 N up and down in 4 s: torques of each arm beside what statics asks for.
 
-    By default the left arm is compliant and the right one under PD; `--left "" --right ""` gives both `--method`.
+    A policy that was trained under PD has its left arm compliant and the right one under PD, unless laws are named.
     """
 
     laws: ClassVar[LawOptions] = LawOptions(left="cotap:alpha=0.7,stiffness=500", right="pd")

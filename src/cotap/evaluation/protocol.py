@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +29,9 @@ class Protocol(ABC):
     """Options that all protocols have."""
 
     laws: ClassVar[LawOptions] = LawOptions()
-    """Laws of the arms unless the command line names others."""
+    """Laws of the arms where the command line names none and the policy was trained under PD."""
+    drives: ClassVar[dict[str, str]] = {}
+    """Fields of laws that the protocol sets itself, each with the option that says how."""
 
     num_envs: int = 1024
     """Number of envs."""
@@ -36,12 +39,22 @@ class Protocol(ABC):
     """Seed of envs and of all that is drawn."""
     torque_limit_scale: float = 1.0
     """Factor on the robot's torque limits."""
+    randomize: bool = True
+    """Domain randomization."""
+
+    def __post_init__(self) -> None:
+        self.film = torch.zeros(0, 0)
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
         require_positive_int("num_envs", self.num_envs)
         require_seed("seed", self.seed)
         require_range("torque_limit_scale", self.torque_limit_scale, 1e-3, 1e3)
+
+    def require_default(self, name: str, when: str) -> None:
+        """Raise ValueError if an option was changed that does nothing `when` the others are as they are."""
+        if getattr(self, name) != getattr(type(self), name):
+            raise ValueError(f"{name} does nothing {when}, got {getattr(self, name)!r}")
 
     @property
     def arms(self) -> str:
@@ -53,6 +66,7 @@ class Protocol(ABC):
         self.check()
         disable_disturbances(env_cfg)
         env_cfg.num_envs, env_cfg.seed, env_cfg.torque_limit_scale = self.num_envs, self.seed, self.torque_limit_scale
+        env_cfg.randomization = RandomizationConfig(enabled=self.randomize)
         env_cfg.terminations = TerminationConfig(episode_s=1e6)  # what ends an episode is a fall
         return env_cfg
 
@@ -61,7 +75,8 @@ class Protocol(ABC):
 
     @abstractmethod
     def evaluate(self, env: HumanoidEnv, policy: PolicyFunction) -> dict[str, Any]:
-        """Run in an environment that is prepared. Returns the measured part of the JSON."""
+        """Run in an environment that is prepared. Returns the measured part of the JSON; `film` (T, nq + 6 H) of the
+        first env, as `Trajectory` has it, is kept."""
 
     def table(self, result: dict[str, Any]) -> str:
         """The result as Markdown."""
@@ -71,19 +86,26 @@ class Protocol(ABC):
     def plot(self, path: Path, result: dict[str, Any]) -> None:
         """Draw the result, as a PNG file."""
 
+    def video(self, path: Path, sheet: Path, env: HumanoidEnv, policy: PolicyFunction) -> None:  # noqa: ARG002
+        """Write a video of the first env as it was evaluated, and a contact sheet."""
+        from cotap.evaluation.render import film_video
+
+        film_video(path, env, self.film, sheet)
+
 
 @dataclass
 class RolloutProtocol(Protocol):
     """A protocol that measures what it recorded of one rollout, in which arms may move."""
 
     motion: tuple[str, ...] = (MIXTURE,)
-    """Clips that the arms follow, `mixture` for what the policy was trained on, or `none` for a pose that is held."""
+    """Clips that the arms follow, `mixture` for what the policy was trained on, or `none` to hold `arm_pose`."""
+    arm_pose: tuple[float, ...] = ()
+    """Arm joints that are held [rad], as of the left arm; the right arm takes the mirror image. Empty for the default
+    pose."""
     library: str = ""
     """Motion library (.npz) that clips are taken from; empty keeps the policy's."""
     upper_actions: str = "policy"
     """What moves the arms: policy, or reference for the raw reference in place of the policy's upper actions."""
-    randomize: bool = True
-    """Domain randomization."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
@@ -93,6 +115,11 @@ class RolloutProtocol(Protocol):
             raise ValueError(f"motion must name clips, {MIXTURE!r} or {HELD!r}, got nothing")
         if len(self.motion) > 1 and not {MIXTURE, HELD}.isdisjoint(self.motion):
             raise ValueError(f"motion: {MIXTURE!r} and {HELD!r} stand alone, got {self.motion}")
+        require_pose(self.arm_pose)
+        if self.arm_pose and self.arms == "moving":
+            raise ValueError(f"arm_pose is held only with motion {HELD!r}, got motion {self.motion}")
+        if self.arms == "held":
+            self.require_default("library", "while arms hold a pose")
 
     @property
     def arms(self) -> str:
@@ -107,9 +134,13 @@ class RolloutProtocol(Protocol):
     def configure(self, env_cfg: HumanoidEnvConfig) -> HumanoidEnvConfig:
         """Turn the environment that a policy was trained in into this protocol's. Changes and returns `env_cfg`."""
         super().configure(env_cfg)
-        env_cfg.randomization = RandomizationConfig(enabled=self.randomize)
         select_motion(env_cfg.motions.clips, self.motion, self.library)
         return env_cfg
+
+    def prepare(self, env: HumanoidEnv) -> None:
+        """Give the arms their pose, unless they follow a motion."""
+        if self.arms == "held":
+            env.motions.hold(mirrored_pose(env, self.arm_pose))
 
     def before_step(self, env: HumanoidEnv, step: int) -> None:
         """Whatever the protocol changes as it goes along."""
@@ -126,13 +157,8 @@ class RolloutProtocol(Protocol):
     def evaluate(self, env: HumanoidEnv, policy: PolicyFunction) -> dict[str, Any]:
         """Run in an environment that is prepared. Returns the measured part of the JSON; `trajectory` is kept."""
         self.trajectory = self.record(env, policy, self.seconds)
+        self.film = self.trajectory.film
         return {"num_falls": int(self.trajectory.fell.any(0).sum()), **self.measure(self.trajectory, env)}
-
-    def video(self, path: Path, sheet: Path, env: HumanoidEnv, policy: PolicyFunction) -> None:  # noqa: ARG002
-        """Write a video of the first env as it was evaluated, and a contact sheet."""
-        from cotap.evaluation.render import film_video
-
-        film_video(path, env, self.trajectory.film, sheet)
 
 
 def select_motion(clips: ClipConfig, motion: tuple[str, ...], library: str) -> None:
@@ -142,6 +168,12 @@ def select_motion(clips: ClipConfig, motion: tuple[str, ...], library: str) -> N
         clips.share, clips.only = 0.0, ()
     elif motion != (MIXTURE,):
         clips.share, clips.only, clips.held_out = 1.0, motion, ()
+
+
+def require_pose(pose: tuple[float, ...]) -> None:
+    """Raise ValueError for an arm joint [rad] that no robot has."""
+    for i, value in enumerate(pose):
+        require_range(f"arm_pose[{i}]", value, -math.pi, 1.5 * math.pi)
 
 
 def mirrored_pose(env: HumanoidEnv, left: tuple[float, ...]) -> torch.Tensor:

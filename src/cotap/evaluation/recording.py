@@ -164,7 +164,7 @@ def _check_plain(name: str, value: Any, levels: int) -> None:
 
 @dataclass
 class RecordingProtocol:
-    """What of a recording is measured."""
+    """A recording of `cotap.play`, measured robot by robot; nothing is simulated."""
 
     file: str = ""
     """The recording (.npz)."""

@@ -96,14 +96,14 @@ def record_rollout(
         obs, _, _, extras = env.step(policy(as_dict(obs, env.device)))
         for name, value in trajectory_row(env, extras["falls"]).items():
             record.setdefault(name, value.new_empty((steps, *value.shape)))[step] = value
-        frames.append(_frame(env))
+        frames.append(picture_row(env))
     return Trajectory(
         dt=env.dt, film=torch.stack(frames).cpu(), **{name: value.cpu() for name, value in record.items()}
     )
 
 
-def _frame(env: HumanoidEnv) -> torch.Tensor:
-    """What a picture of the first env needs: (nq + 6 H,)."""
+def picture_row(env: HumanoidEnv) -> torch.Tensor:
+    """What a picture of the first env needs, a row (nq + 6 H,) of a film."""
     s, hands = env.record.state, len(env.spec.arms)
     points_w = env.record.key_points_reference_t[0, :hands] @ s.torso_rotation_w[0].T + s.torso_pos_w[0]
     return torch.cat((env.sim.qpos[0].float(), points_w.flatten(), env.hand_force_w[0].flatten()))

@@ -1,8 +1,7 @@
-"""What the protocols have in common that run a policy in one mode and disturb it."""
+"""What the protocols have in common that have a robot stand or walk and disturb it."""
 
 from __future__ import annotations
 
-import math
 from abc import ABC
 from dataclasses import dataclass
 
@@ -10,25 +9,20 @@ import torch
 
 from cotap.checks import require_one_of, require_range
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
-from cotap.evaluation.protocol import HELD, RolloutProtocol, mirrored_pose
+from cotap.evaluation.protocol import HELD, Protocol, RolloutProtocol
 
 MODES = ("stance", "walking")
 PELVIS = ("free", "fixed")
 
 
 @dataclass
-class Scenario(RolloutProtocol, ABC):
-    """A robot that stands or walks while its arms hold a pose or follow a motion."""
+class Stance(Protocol, ABC):
+    """A robot that stands, walks or hangs in the air."""
 
-    motion: tuple[str, ...] = (HELD,)
-    """Clips that the arms follow, `mixture` for what the policy was trained on, or `none` to hold `arm_pose`."""
     mode: str = "stance"
     """stance, or walking forward at `speed`."""
     speed: float = 0.5
     """Forward command while walking [m/s]."""
-    arm_pose: tuple[float, ...] = ()
-    """Arm joints that are held [rad], as of the left arm; the right arm takes the mirror image. Empty for the default
-    pose."""
     pelvis: str = "free"
     """free, or fixed: held in the air, without a policy, to see the arms alone."""
     unevenness: float = 0.0
@@ -40,11 +34,12 @@ class Scenario(RolloutProtocol, ABC):
         require_one_of("mode", self.mode, MODES)
         require_range("speed", self.speed, -5.0, 5.0)
         require_one_of("pelvis", self.pelvis, PELVIS)
-        for i, value in enumerate(self.arm_pose):
-            require_range(f"arm_pose[{i}]", value, -math.pi, 1.5 * math.pi)
-        if self.arm_pose and self.arms == "moving":
-            raise ValueError(f"arm_pose is held only with motion {HELD!r}, got motion {self.motion}")
         require_range("unevenness", self.unevenness, 0.0, 0.2)
+        if self.mode == "stance":
+            self.require_default("speed", "in stance: walk with --mode walking")
+        if self.pelvis == "fixed":
+            for name in ("mode", "unevenness", "upper_actions"):
+                self.require_default(name, "while the pelvis is fixed")
 
     def configure(self, env_cfg: HumanoidEnvConfig) -> HumanoidEnvConfig:
         """Turn the environment that a policy was trained in into this protocol's. Changes and returns `env_cfg`."""
@@ -53,10 +48,17 @@ class Scenario(RolloutProtocol, ABC):
         return env_cfg
 
     def prepare(self, env: HumanoidEnv) -> None:
-        """Give every env the mode's command, and its arms their pose unless they follow a motion."""
+        """Give every env the mode's command."""
+        super().prepare(env)
         n, walking = env.num_envs, self.mode == "walking"
         velocity = torch.tensor([self.speed if walking else 0.0, 0.0]).repeat(n, 1)
         stand, height = torch.full((n,), float(not walking)), torch.full((n,), env.spec.nominal_height_m)
         env.commands.override(velocity, torch.zeros(n), stand, height)
-        if self.arms == "held":
-            env.motions.hold(mirrored_pose(env, self.arm_pose))
+
+
+@dataclass
+class Scenario(RolloutProtocol, Stance, ABC):
+    """A robot that stands or walks while its arms hold a pose or follow a motion."""
+
+    motion: tuple[str, ...] = (HELD,)
+    """Clips that the arms follow, `mixture` for what the policy was trained on, or `none` to hold `arm_pose`."""

@@ -17,7 +17,7 @@ from cotap.envs.scripted_forces import ForceProfile
 from cotap.evaluation.linearization import linearize
 from cotap.evaluation.protocol import HELD, Protocol, select_motion
 from cotap.evaluation.report import heading, save_figure
-from cotap.evaluation.rollout import PolicyFunction, idle
+from cotap.evaluation.rollout import PolicyFunction, idle, picture_row
 from cotap.persistence import uniform
 from cotap.robots import RobotSpec
 from cotap.robots.chains import arm_model
@@ -33,13 +33,15 @@ class Stability(Protocol):
 
     num_envs: int = 256
     """Trials of energy: in half of them the stiffness changes meanwhile."""
+    randomize: bool = False
+    """Domain randomization, of the trials of energy."""
     poses: int = 10_000
     """Arm poses to linearise at, uniform within the joints' limits."""
     walls: tuple[float, ...] = (0.0, 100.0, 1000.0, 10000.0)
     """Springs that hold the hand while it is linearised; 0 leaves it free [N/m]."""
     load_rad: float = 0.1
     """Standard deviation of joint errors at which loops are linearised as well, as a load makes them [rad]."""
-    seconds: float = 5.0
+    episode_seconds: float = 5.0
     """Length of a trial [s]."""
     settle_seconds: float = 6.0
     """Rest before it [s]."""
@@ -60,7 +62,7 @@ class Stability(Protocol):
         for i, wall in enumerate(self.walls):
             require_range(f"walls[{i}]", wall, 0.0, 1e7)
         require_range("load_rad", self.load_rad, 0.0, math.pi)
-        require_range("seconds", self.seconds, 0.1, 3600.0)
+        require_range("episode_seconds", self.episode_seconds, 0.1, 3600.0)
         require_range("settle_seconds", self.settle_seconds, 0.1, 3600.0)
         require_range("force", self.force, 0.1, 1000.0)
         require_range("frequency[0]", self.frequency[0], 0.01, 25.0)
@@ -80,7 +82,8 @@ class Stability(Protocol):
         """Analyse and measure the left arm's law. Returns the measured part of the JSON."""
         arms = env.cfg.upper_body
         rates = growth_rates(env.spec, arms.built(arms.left), self)
-        energy = energy_summary(exchanged_energy(env, self))
+        exchanged, self.film = exchanged_energy(env, self)
+        energy = energy_summary(exchanged)
         return {"num_poses": self.poses, "linearised": rates, "energy": energy}
 
     def table(self, result: dict[str, Any]) -> str:
@@ -140,8 +143,9 @@ def swings(protocol: Stability, num_hands: int, rng: torch.Generator) -> tuple[t
     return protocol.force * direction / direction.norm(dim=-1, keepdim=True), rate
 
 
-def exchanged_energy(env: HumanoidEnv, protocol: Stability) -> torch.Tensor:
-    """Energy (T, N) that forces on the hands have put into the robot since their onset, at rest [J].
+def exchanged_energy(env: HumanoidEnv, protocol: Stability) -> tuple[torch.Tensor, torch.Tensor]:
+    """Energy (T, N) that forces on the hands have put into the robot since their onset, at rest [J], and the film of
+    the first env, as `Trajectory` has it.
 
     Nothing is stored at rest, so that a negative one has been drawn from the law. Both hands count together, and what
     they do in the world, as the waist passes energy on from one to the other. In the second half of the envs the
@@ -155,10 +159,10 @@ def exchanged_energy(env: HumanoidEnv, protocol: Stability) -> torch.Tensor:
     changing = torch.arange(env.num_envs, device=env.device) >= env.num_envs // 2
     hold = round(protocol.change_seconds / env.dt)
     energy = torch.zeros(env.num_envs, device=env.device)
-    rows = []
+    rows, frames = [], []
     act = idle(env)
     settle = round(protocol.settle_seconds / env.dt)
-    for step in range(settle + round(protocol.seconds / env.dt)):
+    for step in range(settle + round(protocol.episode_seconds / env.dt)):
         if step >= settle and (step - settle) % hold == 0:
             draw = uniform(rng, -0.5, 0.5, *stiffness.shape).to(env.device)
             changed = stiffness * protocol.change_factor**draw
@@ -167,13 +171,14 @@ def exchanged_energy(env: HumanoidEnv, protocol: Stability) -> torch.Tensor:
         env.forces.scripted.amplitude_h[:, :-1] = torch.sin(rate * since) * amplitude
         before = env.state.hand_pos_w
         _, _, _, extras = env.step(act({}))
+        frames.append(picture_row(env))
         work = (env.hand_force_w * (env.state.hand_pos_w - before)).sum((1, 2))
         # Where an env has diverged it has been restarted: it has given all that can be.
         work = torch.where(extras["falls"], torch.full_like(work, -math.inf), work)
         energy = energy + torch.nan_to_num(work, nan=-math.inf, posinf=-math.inf)
         if step >= settle:
             rows.append(energy.clone())
-    return torch.stack(rows).cpu()
+    return torch.stack(rows).cpu(), torch.stack(frames).cpu()
 
 
 def energy_summary(energy: torch.Tensor) -> dict[str, Any]:

@@ -15,20 +15,22 @@ from cotap.compliance import condition_number
 from cotap.compliance.laws import WITHOUT_STIFFNESS
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.scripted_forces import ForceProfile
-from cotap.evaluation.protocol import HELD, Protocol, mirrored_pose, select_motion
+from cotap.evaluation.protocol import HELD, mirrored_pose, require_pose, select_motion
 from cotap.evaluation.report import heading, save_figure
-from cotap.evaluation.rollout import UPPER_ACTIONS, PolicyFunction, acting
-from cotap.evaluation.scenario import PELVIS
+from cotap.evaluation.rollout import UPPER_ACTIONS, PolicyFunction, acting, picture_row
+from cotap.evaluation.scenario import Stance
 
 
 @dataclass
-class HeldLoad(Protocol):
+class HeldLoad(Stance):
     """What the protocols have in common that load one hand and let it settle."""
 
+    randomize: bool = False
+    """Domain randomization."""
     hand: str = "left"
     """left or right."""
     pelvis: str = "fixed"
-    """fixed: held in the air, no policy. free: standing, legs under the policy."""
+    """fixed: held in the air, without a policy. free: on its legs, under the policy."""
     upper_actions: str = "reference"
     """What moves the arms (pelvis free): policy, or reference for the raw reference instead of its upper actions."""
     settle_seconds: float = 10.0
@@ -38,7 +40,6 @@ class HeldLoad(Protocol):
         """Raise ValueError naming the first field that is out of its range."""
         super().check()
         require_one_of("hand", self.hand, ("left", "right"))
-        require_one_of("pelvis", self.pelvis, PELVIS)
         require_one_of("upper_actions", self.upper_actions, UPPER_ACTIONS)
         require_range("settle_seconds", self.settle_seconds, 2.0, 600.0)
 
@@ -50,16 +51,13 @@ class HeldLoad(Protocol):
     def configure(self, env_cfg: HumanoidEnvConfig) -> HumanoidEnvConfig:
         """Turn the environment that a policy was trained in into this protocol's. Changes and returns `env_cfg`."""
         super().configure(env_cfg)
-        env_cfg.fixed_base = self.pelvis == "fixed"
         select_motion(env_cfg.motions.clips, (HELD,), "")
         env_cfg.forces.scripted = ForceProfile((1.0, 1.0, 1.0), self.hand, self.settle_seconds)
         return env_cfg
 
     def load(self, env: HumanoidEnv, force_h: torch.Tensor) -> int:
-        """Have every env stand and load the hand by `force_h` (N, 3) [N], heading frame. Returns which hand that is."""
-        n, side = env.num_envs, [arm.side for arm in env.spec.arms].index(self.hand)
-        height = torch.full((n,), env.spec.nominal_height_m)
-        env.commands.override(torch.zeros(n, 2), torch.zeros(n), torch.ones(n), height)
+        """Load the hand of every env by `force_h` (N, 3) [N], heading frame. Returns which hand that is."""
+        side = [arm.side for arm in env.spec.arms].index(self.hand)
         env.forces.scripted.amplitude_h.zero_()
         env.forces.scripted.amplitude_h[:, side] = force_h.to(env.device)
         return side
@@ -85,14 +83,14 @@ class StaticStiffness(HeldLoad):
             require_finite(f"force[{i}]", value)
         if not any(self.force):
             raise ValueError(f"force must not be zero along all axes, got {self.force}")
-        for i, value in enumerate(self.arm_pose):
-            require_range(f"arm_pose[{i}]", value, -math.pi, 1.5 * math.pi)
+        require_pose(self.arm_pose)
         require_range("levels", self.levels, 2, 1000)
         if self.num_envs < self.levels:
             raise ValueError(f"num_envs must be at least levels ({self.levels}), got {self.num_envs}")
 
     def prepare(self, env: HumanoidEnv) -> None:
         """Give every env its load, and its arms their pose."""
+        super().prepare(env)
         shares = torch.linspace(0.0, 1.0, self.levels)[torch.arange(env.num_envs) % self.levels]
         self.load(env, shares.unsqueeze(1) * torch.tensor(self.force))
         env.motions.hold(mirrored_pose(env, self.arm_pose))
@@ -102,6 +100,7 @@ class StaticStiffness(HeldLoad):
         law = env.cfg.upper_body.of(self.hand)
         commanded = None if law.name in WITHOUT_STIFFNESS else law.stiffness
         measured = measure(env, self, policy)
+        self.film = measured.film
         return {"num_falls": measured.num_falls, **summary(measured, commanded), "window": self.window}
 
     def table(self, result: dict[str, Any]) -> str:
@@ -128,6 +127,8 @@ class StaticResult:
     num_falls: int
     spread: torch.Tensor = field(default_factory=lambda: torch.zeros(0))
     """(L, 3) standard deviation over envs [m]."""
+    film: torch.Tensor = field(default_factory=lambda: torch.zeros(0, 0))
+    """Of the first env, as `Trajectory` has it."""
 
     def effective_stiffness(self) -> list[float | None]:
         """Full load over displacement, per axis that is loaded [N/m]; None where nothing pushes or nothing moves."""
@@ -149,6 +150,8 @@ class Settled:
     """(N,) bool."""
     saturated: torch.Tensor
     """(N,) bool: an arm joint was at its torque limit at the end."""
+    film: torch.Tensor
+    """Of the first env, as `Trajectory` has it."""
 
 
 def settle(env: HumanoidEnv, policy: PolicyFunction, seconds: float, side: int) -> Settled:
@@ -163,6 +166,7 @@ def settle(env: HumanoidEnv, policy: PolicyFunction, seconds: float, side: int) 
     obs = env.reset()
     fell = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
     averages: list[torch.Tensor] = []
+    frames: list[torch.Tensor] = []
     steps, window = round(seconds / env.dt), round(1.0 / env.dt)
     rotation = torch.zeros(env.num_envs, 3, 3, device=env.device)
     condition = torch.zeros(env.num_envs, device=env.device)
@@ -171,6 +175,7 @@ def settle(env: HumanoidEnv, policy: PolicyFunction, seconds: float, side: int) 
         for step in range(steps):
             obs, _, _, extras = env.step(policy(as_dict(obs, env.device)))
             fell |= extras["falls"]
+            frames.append(picture_row(env))
             if step >= steps - window:
                 total += env.record.state.arms.tip[:, side] / window
         averages.append(total)
@@ -181,7 +186,7 @@ def settle(env: HumanoidEnv, policy: PolicyFunction, seconds: float, side: int) 
     moved = (rotation @ (averages[1] - averages[0]).unsqueeze(-1)).squeeze(-1)
     torque = env.record.torque[:, env.action_slices["upper"]].unflatten(1, (len(env.spec.arms), -1))[:, side]
     saturated = (torque.abs() > 0.999 * env.arm_limits[side]).any(1)
-    return Settled(moved.cpu(), condition.cpu(), fell.cpu(), saturated.cpu())
+    return Settled(moved.cpu(), condition.cpu(), fell.cpu(), saturated.cpu(), torch.stack(frames).cpu())
 
 
 def measure(env: HumanoidEnv, protocol: StaticStiffness, policy: PolicyFunction) -> StaticResult:
@@ -197,6 +202,7 @@ def measure(env: HumanoidEnv, protocol: StaticStiffness, policy: PolicyFunction)
     return StaticResult(
         env.forces.scripted.amplitude_h[: protocol.levels, side].cpu(), torch.stack(means),
         float(settled.condition.mean()), bool(settled.saturated.any()), int(settled.fell.sum()), torch.stack(spreads),
+        settled.film,
     )  # fmt: skip
 
 

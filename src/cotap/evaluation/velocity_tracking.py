@@ -51,6 +51,7 @@ class VelocityTracking(RolloutProtocol):
     with."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not self.arm_motion:
             self.motion = (HELD,)
 
@@ -84,11 +85,6 @@ class VelocityTracking(RolloutProtocol):
         c.resample_s = (self.command_seconds, self.command_seconds)
         c.stand_probability, c.axis_zero_probability = self.stand_probability, 0.0
         return env_cfg
-
-    def prepare(self, env: HumanoidEnv) -> None:
-        """Hold the arms' default pose, if arms are held."""
-        if self.arms == "held":
-            env.motions.hold(env.motions.default)
 
     def measure(self, trajectory: Trajectory, env: HumanoidEnv) -> dict[str, Any]:
         """The measured part of the evaluation's JSON, falls aside."""
