@@ -7,8 +7,10 @@ import json
 import pytest
 import torch
 
-from cotap.compare import compare, difference, main
+from cotap.compare import compare, difference, main, table
 from cotap.evaluation.metrics import summarize
+from cotap.evaluation.policy import shipped_checkpoint, shipped_names
+from cotap.evaluation.report import better
 
 
 def result(**metrics):
@@ -106,6 +108,44 @@ def test_envs_that_are_none_are_refused(tmp_path, capsys, envs, named):
     assert named in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("measure", "b", "shown", "b_is"),
+    [("e_torso", 1.5, "e_torso (less)", "worse"), ("force_e_ee", 0.5, "force_e_ee (less)", "better"),
+     ("still_share", 1.5, "still_share (more)", "better"),
+     ("seconds_upright", 0.5, "seconds_upright (more)", "worse"),
+     ("displacement_x", 0.5, "displacement_x", "less"), ("e_yaw", 1.01, "e_yaw (less)", "not distinguishable")],
+)  # fmt: skip
+def test_what_is_better_is_said(measure, b, shown, b_is):
+    summaries = [{measure: {"mean": v, "ci95": [v - 0.1, v + 0.1]}} for v in (1.0, b)]
+    out = compare(*(result(**s) for s in summaries))
+    assert out["differences"][measure]["b_is"] == b_is
+    (row,) = (line for line in table(out).splitlines() if measure in line)
+    assert row.startswith(f"| {shown} |")
+    assert row.endswith(f"| {b_is} |")
+
+
+def test_every_measure_that_is_written_has_a_direction_or_has_none_on_purpose():
+    shipped = shipped_checkpoint(shipped_names()[0]).parent
+    measures = {name for file in shipped.glob("*.*.json") for name in json.loads(file.read_text())["metrics"]}
+    neither = {"j_upper", "j_upper_blow", "peak_torque", "energy", "swing_height", "displacement_x", "displacement_y",
+               "displacement_z"}  # fmt: skip
+    assert {name for name in measures if not better(name)} <= neither
+    assert len(measures) > 15
+
+
+@pytest.mark.parametrize("missing", [0, 1])
+def test_a_file_that_is_not_there_is_named(tmp_path, capsys, missing):
+    files = [tmp_path / "a.json", tmp_path / "b.json"]
+    files[1 - missing].write_text(json.dumps(result(x={"mean": 1.0, "ci95": [0.9, 1.1]})))
+    assert main([str(file) for file in files]) == 2
+    assert capsys.readouterr().err == f"error: {str(files[missing])!r} does not exist\n"
+
+
+def test_that_the_result_cannot_be_written_is_found_first(tmp_path, capsys):
+    assert main(["none.json", "none.json", "--json", str(tmp_path / "no" / "out.json")]) == 2
+    assert "its folder does not exist" in capsys.readouterr().err
+
+
 def test_what_one_could_not_measure_is_null_with_the_reason():
     none = {"mean": None, "ci95": None, "reason": "no env"}
     d = difference(none, {"mean": 1.0, "ci95": [0.5, 1.5]})
@@ -127,7 +167,7 @@ def test_the_command(tmp_path, capsys):
     a.write_text(json.dumps(result(x={"mean": 1.0, "ci95": [0.9, 1.1]})))
     b.write_text(json.dumps(result(x={"mean": 1.5, "ci95": [1.4, 1.6]})))
     assert main([str(a), str(b), "--json", str(tmp_path / "out.json")]) == 0
-    assert "| x | 1.0000 | 1.5000 | +0.5000 |" in capsys.readouterr().out
+    assert "| x | 1.0000 | 1.5000 | +0.5000 | +0.3586 to +0.6414 | more |" in capsys.readouterr().out
     assert json.loads((tmp_path / "out.json").read_text())["differences"]["x"]["difference"] == 0.5
 
 

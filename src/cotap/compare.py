@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import tyro
 
 from cotap.checks import is_finite, quoted, shortened
+from cotap.files import require_output
 from cotap.inputs import InputError, read_text
 
 
@@ -24,7 +25,7 @@ class CompareOptions:
     b: Annotated[str, tyro.conf.Positional]
     """Another's."""
     without_falls: bool = False
-    """Compare the figures of envs that stood."""
+    """Compare the figures of envs that stood to the end."""
     json: str = ""
     """Write the differences here."""
 
@@ -35,6 +36,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         from cotap.agents.checkpoint import write_json
 
+        require_output("--json", options.json)
         result = compare(read(options.a), read(options.b), options.without_falls)
         print(table(result))
         if options.json:
@@ -106,7 +108,7 @@ def compare(a: dict[str, Any], b: dict[str, Any], without_falls: bool = False) -
         raise ValueError(f"protocols differ: {quoted(a['protocol'])} and {quoted(b['protocol'])}")
     key = "metrics_without_falls" if without_falls else "metrics"
     names = [name for name in a.get(key, {}) if name in b.get(key, {})]
-    rows = {name: measure_difference(a, b, name, without_falls) for name in names}
+    rows = {name: judged(name, measure_difference(a, b, name, without_falls)) for name in names}
     old, new = (_flat(x["settings"] | {"method": x.get("method"), "window": x.get("window")}) for x in (a, b))
     settings = {
         name: [old.get(name), new.get(name)]
@@ -114,6 +116,20 @@ def compare(a: dict[str, Any], b: dict[str, Any], without_falls: bool = False) -
         if old.get(name) != new.get(name)
     }
     return {"protocol": a["protocol"], "differences": rows, "settings": settings}
+
+
+def judged(name: str, row: dict[str, Any]) -> dict[str, Any]:
+    """A measure's difference with what is `better`, less or more (empty: neither), and what `b_is` by its interval:
+    better, worse, more or less where neither is better, or not distinguishable."""
+    from cotap.evaluation.report import better
+
+    wanted, b_is = better(name), ""
+    if row["difference"] is not None:
+        low, high = row["ci95"]
+        way = "more" if low > 0.0 else "less" if high < 0.0 else ""
+        judgement = way if not wanted else "better" if way == wanted else "worse"
+        b_is = judgement if way else "not distinguishable"
+    return row | {"better": wanted, "b_is": b_is}
 
 
 def measure_difference(a: dict[str, Any], b: dict[str, Any], name: str, without_falls: bool) -> dict[str, Any]:
@@ -177,16 +193,16 @@ def _flat(tree: Any, prefix: str = "") -> dict[str, Any]:
 
 def table(result: dict[str, Any]) -> str:
     """Differences as Markdown, then the settings that differ."""
-    lines = ["| measure | A | B | B - A | 95 % interval | differs |", "|---|---|---|---|---|---|"]
+    lines = ["| measure (better) | A | B | B - A | 95 % interval | B is |", "|---|---|---|---|---|---|"]
     for name, row in result["differences"].items():
+        shown = f"{name} ({row['better']})" if row["better"] else name
         if row["difference"] is None:
-            lines.append(f"| {name} | - | - | - | {row['reason']} | |")
+            lines.append(f"| {shown} | - | - | - | {row['reason']} | |")
             continue
         low, high = row["ci95"]
-        differs = "yes" if low * high > 0.0 else "no"
         lines.append(
-            f"| {name} | {row['a']:.4f} | {row['b']:.4f} | {row['difference']:+.4f} | {low:+.4f} to {high:+.4f} "
-            f"| {differs} |"
+            f"| {shown} | {row['a']:.4f} | {row['b']:.4f} | {row['difference']:+.4f} | {low:+.4f} to {high:+.4f} "
+            f"| {row['b_is']} |"
         )
     if pairs := [row["pairs"] for row in result["differences"].values() if "pairs" in row]:
         lines += ["", f"Compared env by env, {min(pairs)} to {max(pairs)} envs a measure."]

@@ -20,6 +20,23 @@ UNITS = {
     "seconds_upright": "s", "j_upper_blow": "Nm",
 }  # fmt: skip
 
+LESS_IS_BETTER = (
+    "e_lin", "e_lin_gait", "e_yaw", "e_yaw_gait", "e_height", "e_upper", "e_ee", "e_ee_hit", "e_path", "e_torso",
+    "e_torso_x", "e_torso_y", "stand_drift", "foot_slip", "fall_fraction", "share_at_limit", "recovery_s", "settle_s",
+    "transient_energy", "oscillation_energy", "overshoot", "overshoots", "load_overshoot", "stiffness_error",
+)  # fmt: skip
+MORE_IS_BETTER = (
+    "still_share", "episode_length_fraction", "recovered_fraction", "settled_fraction", "completed_fraction",
+    "waypoints_reached", "seconds_upright",
+)  # fmt: skip
+"""Measures of which one direction is better. Of the others neither is: a soft hand goes far, and should."""
+
+
+def better(measure: str) -> str:
+    """`less` or `more`, whichever of a measure is better; empty if neither is."""
+    name = measure.removeprefix("force_")  # what a recording has of the time after its first force
+    return "less" if name in LESS_IS_BETTER else "more" if name in MORE_IS_BETTER else ""
+
 
 def require_outputs(json: str, plot: str, video: str) -> None:
     """Fail before the work rather than after it: ValueError where results cannot be written, or replace each other."""
