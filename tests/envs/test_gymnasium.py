@@ -11,7 +11,7 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
-from gymnasium.wrappers.vector import RecordEpisodeStatistics
+from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics, TransformObservation
 
 import cotap  # noqa: F401 - registers the ids
 from cotap.envs import HumanoidEnvConfig
@@ -239,6 +239,101 @@ def test_gymnasiums_statistics_wrapper_works(vector):
     assert truncation.all()
     np.testing.assert_allclose(infos["episode"]["r"], total, atol=1e-6)
     assert infos["episode"]["l"].tolist() == [5, 5, 5]
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_a_mask_restarts_its_envs_and_leaves_the_others_alone(robot, mode):
+    """The others go on as if nothing had been; there is no noise here, and no other random numbers."""
+    still = {"robot": robot, "num_threads": 1, "autoreset_mode": mode}
+    masked, plain = HumanoidVectorEnv(3, **still), HumanoidVectorEnv(3, **still)
+    for env in (masked, plain):
+        env.reset(seed=0)
+        for _ in range(3):
+            before, *_ = env.step(zeros(env) + np.float32(0.2))
+    mask = np.array([False, True, False])
+    observation, infos = masked.reset(options={"reset_mask": mask})
+    assert infos == {}
+    np.testing.assert_array_equal(observation[~mask], before[~mask])
+    assert np.abs(observation[mask] - before[mask]).max() > 0.1
+    assert masked.envs.episode_length_buf.tolist() == [3, 0, 3]
+    for _ in range(3):
+        seen, expected = (env.step(zeros(env))[0] for env in (masked, plain))
+        np.testing.assert_allclose(seen[~mask], expected[~mask], atol=1e-5)
+
+
+def test_ended_envs_restart_in_the_next_step_where_that_is_asked_for(robot):
+    cfg = HumanoidEnvConfig(robot=robot, num_threads=1, terminations=SHORT)
+    same, following = HumanoidVectorEnv(2, cfg), HumanoidVectorEnv(2, cfg, autoreset_mode="NextStep")
+    assert following.metadata["autoreset_mode"] == AutoresetMode.NEXT_STEP
+    for env in (same, following):
+        env.reset(seed=3)
+    following.envs.episode_length_buf[1] = -3  # its episode is longer
+    for _ in range(5):
+        _, _, _, _, infos = same.step(zeros(same))
+        last, reward, _, truncation, own = following.step(zeros(following))
+    assert truncation.tolist() == [True, False]
+    np.testing.assert_array_equal(last[0], infos["final_obs"][0])
+    assert "final_obs" not in own
+    assert own["diverged"].tolist() == [False, False]
+    assert reward[0] != 0.0
+    actions = zeros(following)
+    actions[0] = np.nan  # of an env that restarts no action is asked
+    first, reward, termination, truncation, infos = following.step(actions)
+    assert not (termination | truncation).any()
+    assert (reward[0], infos["group_rewards"][0].tolist()) == (0.0, [0.0, 0.0])
+    assert reward[1] != 0.0
+    assert following.envs.episode_length_buf.tolist() == [0, 3]
+    np.testing.assert_array_equal(first, following.envs.get_observations()["policy"])
+    width, steps = following.envs.observer.history.width, following.envs.observer.history.steps
+    np.testing.assert_array_equal(first[0, :3], first[0, 3 * (steps - 1) : 3 * steps])  # a history of one moment
+    assert first.shape == (2, width * steps)
+    for _ in range(4):
+        *_, truncation, _ = following.step(zeros(following))
+    assert truncation.tolist() == [False, False]
+    *_, truncation, _ = following.step(zeros(following))
+    assert truncation.tolist() == [True, False]
+
+
+def test_without_autoreset_the_caller_restarts(robot):
+    env = HumanoidVectorEnv(2, robot=robot, num_threads=1, terminations=SHORT, autoreset_mode=AutoresetMode.DISABLED)
+    env.reset(seed=0)
+    for _ in range(5):
+        last, _, _, truncation, _ = env.step(zeros(env))
+    first, _ = env.reset(options={"reset_mask": truncation})
+    assert np.abs(first - last).max() > 0.1
+    assert not env.step(zeros(env))[3].any()
+
+
+@pytest.mark.parametrize("wrapper", [NormalizeObservation, lambda env: TransformObservation(env, lambda o: 2.0 * o)])
+def test_gymnasiums_observation_wrappers_take_the_next_step_mode(robot, wrapper):
+    env = wrapper(HumanoidVectorEnv(2, robot=robot, num_threads=1, terminations=SHORT, autoreset_mode="NextStep"))
+    env.reset(seed=0)
+    for _ in range(8):
+        observation, *_ = env.step(zeros(env))
+    assert np.isfinite(observation).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "seed", "message"),
+    [
+        ({"reset_mask": np.array([True, False])}, None, r"of shape \(3,\), got bool of \(2,\)"),
+        ({"reset_mask": np.array([1, 0, 0])}, None, "array of bool .*, got int64"),
+        ({"reset_mask": [True, False, False]}, None, r"array of bool .*, got \[True"),
+        ({"reset_mask": np.zeros(3, dtype=bool)}, None, "one env at least"),
+        ({"reset_mask": np.ones(3, dtype=bool)}, 4, "goes without a seed, got 4"),
+        ({"mask": None}, None, "reset knows no option 'mask'; known: reset_mask"),
+    ],
+)
+def test_options_that_cannot_be_are_refused(vector, options, seed, message):
+    with pytest.raises(ValueError, match=message):
+        vector.reset(seed=seed, options=options)
+
+
+def test_a_mode_that_there_is_not_is_refused():
+    with pytest.raises(ValueError, match="autoreset_mode 'Never' is unknown; known: Disabled, NextStep, SameStep"):
+        HumanoidVectorEnv(1, autoreset_mode="Never")
+    with pytest.raises(ValueError, match="reset knows no option 'reset_mask'; known: none"):
+        HumanoidSingleEnv(num_threads=1).reset(options={"reset_mask": np.ones(1, dtype=bool)})
 
 
 def test_gymnasiums_own_vectors_take_it():
