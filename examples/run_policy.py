@@ -2,6 +2,8 @@
 
 `python examples/run_policy.py policy.onnx` runs it for a second on sensors that always say the same: a robot at rest
 in its default pose. A robot puts its own sensors and motors in their place, and calls `step` every `control_dt`.
+`--check` takes the readings that the file has with it through the loop, and compares observation and targets with its
+own.
 """
 
 from __future__ import annotations
@@ -31,7 +33,7 @@ class Command:
     velocity: tuple[float, float] = (0.0, 0.0)  # forward and leftward [m/s]
     yaw_rate: float = 0.0  # to the left [rad/s]
     stand: bool = True
-    height: float | None = None  # of the torso link [m]; None for the nominal height
+    height: float | None = None  # of the torso link above the ground, absolute [m]; None for the nominal height
 
 
 class PolicyRunner:
@@ -62,6 +64,7 @@ class PolicyRunner:
         self.reference = self.default[-num_arms:] if arm_reference is None else np.array(arm_reference)
         self.action = np.zeros(len(self.default))
         self.targets: np.ndarray | None = None
+        self.observation = np.zeros(0, np.float32)
         self.history: list[dict[str, np.ndarray]] = []
 
     def step(self, sensors: Sensors, command: Command, arm_reference: np.ndarray) -> np.ndarray:
@@ -74,8 +77,8 @@ class PolicyRunner:
         present = self.observe(sensors)
         self.history = [*(self.history or [present] * self.meta["observation"]["history"])[1:], present]
         terms = [name for name, _, _ in self.meta["observation"]["terms"]]
-        observation = np.concatenate([moment[name] for name in terms for moment in self.history])
-        (targets,) = self.session.run(None, {"observation": observation[None].astype(np.float32)})
+        self.observation = np.concatenate([m[name] for name in terms for m in self.history]).astype(np.float32)
+        (targets,) = self.session.run(None, {"observation": self.observation[None]})
         self.action = (np.asarray(targets)[0] - self.offset(self.reference)) / self.action_scale
         self.reference = np.array(arm_reference)
         self.targets = sent = self.offset(self.reference) + self.action_scale * self.action
@@ -127,6 +130,20 @@ class PolicyRunner:
         return np.concatenate((self.default[: -len(reference)], reference))
 
 
+def check(path: str) -> None:
+    """Compare the loop's first step with the one that the file has worked out; exit with 1 where they differ."""
+    runner = PolicyRunner(path)
+    golden = runner.meta["golden"]
+    names = ("joint_pos", "joint_vel", "angular_velocity", "gravity")
+    sensors = Sensors(*(np.array(golden["readings"][name]) for name in names))
+    targets = runner.step(sensors, Command(), runner.reference)
+    for name, got in (("observation", runner.observation), ("joint_targets", targets)):
+        worst = float(np.abs(got - np.array(golden[name])).max())
+        print(f"{name}: differs from the file's by at most {worst:.1e}")
+        if not worst <= 1e-5:
+            sys.exit(1)
+
+
 def main(path: str) -> None:
     """Run for a second on a robot that never moves, and show where its joints are sent."""
     runner = PolicyRunner(path)
@@ -138,4 +155,4 @@ def main(path: str) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    check(sys.argv[2]) if sys.argv[1] == "--check" else main(sys.argv[1])

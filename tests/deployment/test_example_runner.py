@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -93,6 +94,20 @@ def test_it_needs_numpy_and_onnxruntime_alone(policy_file):
     )
     assert done.returncode == 0, done.stderr
     assert len(done.stdout.splitlines()) == len(OnnxPolicy(policy_file).metadata.joints)
+
+
+def test_the_loop_is_checked_against_the_file(robot, random_policy, example, tmp_path, capsys):
+    path = random_policy(robot=robot, output_gain=0.3)
+    example.check(str(path))
+    assert capsys.readouterr().out.count("differs from the file's by at most") == 2
+    proto = onnx.load(path)
+    golden = next(p for p in proto.metadata_props if p.key == "golden")
+    content = json.loads(golden.value)
+    content["readings"]["joint_pos"] = content["readings"]["joint_pos"][::-1]
+    golden.value = json.dumps(content)
+    onnx.save(proto, tmp_path / "p.onnx")
+    with pytest.raises(SystemExit):
+        example.check(str(tmp_path / "p.onnx"))
 
 
 def test_it_refuses_arms_under_another_law(policy_file, example, tmp_path):

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import onnx
 import pytest
+import torch
 
 from cotap.agents.actors import as_dict
 from cotap.agents.checkpoint import CheckpointError, load_checkpoint, save_checkpoint, sha256
@@ -97,10 +98,40 @@ def test_metadata_is_what_a_robot_needs(robot, random_checkpoint, random_policy)
     assert m.observation_width == 5 * (13 + 3 * joints + 2 * (joints - lower))
 
 
+def test_metadata_says_what_each_term_of_the_observation_is(robot, random_checkpoint, random_policy):
+    m, spec = OnnxPolicy(random_policy(robot=robot)).metadata, ROBOTS[robot]()
+    c = load_policy(random_checkpoint(robot=robot)).env_config.commands
+    about = m.observation["about"]
+    assert list(about) == [name for name, _, _ in m.observation["terms"]]
+    assert all(entry["what"] and entry["unit"] in ("rad", "rad/s", "m", "m/s", "Nm", "1") for entry in about.values())
+    # The height is that of the torso link above the ground, not an offset.
+    lowest, highest = about["command_height"]["range"]
+    assert (lowest, highest) == pytest.approx((spec.nominal_height_m + c.height_offset[0], spec.nominal_height_m))
+    assert about["command_velocity"]["range"] == [
+        [c.velocity_x[0], c.velocity_y[0]],
+        [c.velocity_x[1], c.velocity_y[1]],
+    ]
+    for (name, width, _), entry in zip(m.observation["terms"], about.values(), strict=True):
+        for bound in entry["range"] or ():
+            assert not isinstance(bound, list) or len(bound) == width, name
+    q = np.array(m.golden["readings"]["joint_pos"])
+    low, high = (np.array(bound) for bound in about["joint_position"]["range"])
+    assert ((low <= q - m.default_pose_rad) & (q - m.default_pose_rad <= high)).mean() > 0.9
+
+
+def test_the_golden_pair_is_the_policys(random_checkpoint, random_policy):
+    policy, model = OnnxPolicy(random_policy(output_gain=0.3)), load_policy(random_checkpoint(output_gain=0.3))
+    golden = policy.metadata.golden
+    np.testing.assert_allclose(policy(np.array(golden["observation"])), golden["joint_targets"], atol=1e-5)
+    action = model({"policy": torch.tensor([golden["observation"]])})[0].numpy()
+    np.testing.assert_allclose(policy.action(np.array(golden["joint_targets"]), np.zeros(8)), action, atol=1e-5)
+    assert np.abs(action).max() > 0.01
+
+
 def test_a_distilled_policy_says_in_which_ranges_its_law_was_trained(spec):
     training = DISTILL_RECIPES["default"](BASE_RECIPES["default"]())
     targets = JointTargets(training.env.actions, spec)
-    metadata = graph_module.describe(training.env, spec, targets, "distill", "0" * 64)
+    metadata = graph_module.describe(training.env, spec, targets, "distill", "0" * 64, {})
     assert metadata.law["left"]["name"] == "cotap"
     assert metadata.law["sampling"]["enabled"]
     assert metadata.law["sampling"]["stiffness"] == [80.0, 1200.0]
@@ -161,6 +192,12 @@ def _set(proto, name, value):
     next(p for p in proto.metadata_props if p.key == name).value = value
 
 
+def _narrow(proto):
+    golden = next(p for p in proto.metadata_props if p.key == "golden")
+    _set(proto, "golden", json.dumps(json.loads(golden.value) | {"observation": [0.0] * 15}))
+    _set(proto, "observation", '{"terms": [["a", 3, 1.0]], "history": 5}')
+
+
 def _widen(proto):
     proto.graph.input[0].type.tensor_type.shape.dim[1].dim_value += 1
 
@@ -177,10 +214,10 @@ def _widen(proto):
         (lambda p: _set(p, "observation", '{"terms": [["a", 3, "1"]], "history": 5}'), "scale"),
         (lambda p: _set(p, "observation", '{"terms": [["a", 3]], "history": 5}'), r"scale\): \['a', 3\]"),
         (lambda p: _set(p, "control_dt", "-1"), "control_dt must lie in"),
-        (lambda p: _set(p, "format", '"cotap-policy-7"'), "this cotap reads 'cotap-policy-2'"),
+        (lambda p: _set(p, "format", '"cotap-policy-7"'), "this cotap reads 'cotap-policy-3'"),
         (lambda p: _set(p, "observation", "{}"), "observation lacks 'terms'"),
         (lambda p: _set(p, "joints", '["a"]'), "entries for 1 joints"),
-        (lambda p: _set(p, "observation", '{"terms": [["a", 3, 1.0]], "history": 5}'), "its metadata asks for"),
+        (_narrow, "its metadata asks for"),
         (_widen, "cannot be read as ONNX: .*Incompatible dimensions"),
     ],
 )
@@ -198,6 +235,8 @@ def test_files_that_are_no_policy_are_refused_by_name(change, message, policy_fi
         ("joints", ["a"] * 19, "metadata joints must be a list of different names"),
         ("joints", {"a": 1}, "metadata joints must be a list of different names"),
         ("kp", 100.0, "metadata kp must be a list"),
+        ("golden", {"observation": [1.0], "joint_targets": []}, "golden.observation has 1 entries for 430 numbers"),
+        ("golden", {}, "golden.observation must be a list, got None"),
         ("kd", [True] * 19, "kd holds what is not a finite number"),
         ("nominal_height_m", "1", "metadata nominal_height_m must be a finite number"),
         ("control_dt", True, "metadata control_dt must be a finite number"),

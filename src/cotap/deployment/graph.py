@@ -19,6 +19,7 @@ from cotap.agents.checkpoint import require_layout, sha256
 from cotap.configs import to_plain
 from cotap.deployment.metadata import FORMAT, INPUT, TARGETS, PolicyMetadata
 from cotap.deployment.policy import OnnxPolicy
+from cotap.deployment.terms import about_terms, golden_moment
 from cotap.envs import HumanoidEnvConfig
 from cotap.envs.actions import JointTargets
 from cotap.envs.observations import Term, actor_terms
@@ -79,7 +80,11 @@ def export_policy(checkpoint: Path | str, output: Path, checks: int = 1000, seed
     targets = JointTargets(cfg.actions, spec)
     reference = newest(terms, history, "reference_arm_position")
     graph = TargetGraph(policy.model, targets, cfg.actions.clip, reference).eval()
-    metadata = describe(cfg, spec, targets, policy.stage, sha256(checkpoint))
+    readings, observation = golden_moment(spec, terms, history, seed)
+    with torch.no_grad():
+        golden = {"readings": readings, "observation": observation.tolist(),
+                  "joint_targets": graph(observation.unsqueeze(0))[0].tolist()}  # fmt: skip
+    metadata = describe(cfg, spec, targets, policy.stage, sha256(checkpoint), golden)
     worst = 0.0
 
     def write(temporary: Path) -> None:
@@ -99,10 +104,11 @@ def terms_of(cfg: HumanoidEnvConfig, spec: RobotSpec) -> tuple[Term, ...]:
 
 
 def describe(
-    cfg: HumanoidEnvConfig, spec: RobotSpec, targets: JointTargets, stage: str, checkpoint_sha256: str
-) -> PolicyMetadata:
+    cfg: HumanoidEnvConfig, spec: RobotSpec, targets: JointTargets, stage: str, checkpoint_sha256: str,
+    golden: dict[str, Any],
+) -> PolicyMetadata:  # fmt: skip
     """The metadata of a policy that was trained in the environment `cfg`."""
-    joints = spec.joints
+    joints, terms = spec.joints, terms_of(cfg, spec)
     return PolicyMetadata(
         format=FORMAT,
         robot=spec.name,
@@ -114,14 +120,15 @@ def describe(
         torque_limit_nm=[cfg.torque_limit_scale * j.torque_limit_nm for j in joints],
         action={"scale_rad": [round(v, 9) for v in targets.scale.tolist()], "clip": cfg.actions.clip,
                 "upper_mode": cfg.actions.upper_mode},
-        observation={"terms": [list(t) for t in terms_of(cfg, spec)], "history": cfg.observations.history,
-                     "order": ORDER, "frames": FRAMES},
+        observation={"terms": [list(t) for t in terms], "history": cfg.observations.history,
+                     "about": about_terms(cfg, spec, terms), "order": ORDER, "frames": FRAMES},
         control_dt=cfg.control_dt,
         gait=to_plain(cfg.gait),
         commands=to_plain(cfg.commands),
         nominal_height_m=spec.nominal_height_m,
         terminations=to_plain(cfg.terminations),
         law=to_plain(cfg.upper_body),
+        golden=golden,
         checkpoint_sha256=checkpoint_sha256,
         cotap_version=__version__,
         opset=OPSET,

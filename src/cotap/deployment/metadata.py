@@ -9,7 +9,7 @@ from typing import Any
 
 from cotap.checks import is_finite, legible, quoted, require_one_of, require_positive_int, require_range
 
-FORMAT = "cotap-policy-2"
+FORMAT = "cotap-policy-3"
 INPUT, TARGETS = "observation", "joint_targets"
 UPPER_MODES = ("residual", "absolute")
 PER_JOINT = ("default_pose_rad", "kp", "kd", "torque_limit_nm")
@@ -42,7 +42,8 @@ class PolicyMetadata:
     """`scale_rad` (J,) radians of target per unit of action, `clip` the largest magnitude of an action, and what the
     arms' actions are added to, `upper_mode`: residual (the reference) or absolute (the default pose)."""
     observation: dict[str, Any]
-    """`terms` (name, width, scale), `history` in steps, and in words `order` and `frames`."""
+    """`terms` (name, width, scale), `history` in steps, `about` each term what it is, its unit and its range, and in
+    words `order` and `frames`."""
     control_dt: float
     """Time between two observations [s]."""
     gait: dict[str, Any]
@@ -50,11 +51,14 @@ class PolicyMetadata:
     commands: dict[str, Any]
     """Ranges that commands were drawn from, and the rates at which they are approached."""
     nominal_height_m: float
-    """Height of the torso link above flat ground in the default pose."""
+    """Height of the torso link's origin above flat ground in the default pose [m]."""
     terminations: dict[str, Any]
     """What counted as a fall."""
     law: dict[str, Any]
     """The arms' laws in training (`left`, `right`) and all that belongs to them."""
+    golden: dict[str, Any]
+    """A first step worked out: `readings`, the `observation` (O,) that they make, and its `joint_targets` (J,) [rad],
+    to check a robot's loop against."""
     checkpoint_sha256: str
     cotap_version: str
     opset: int
@@ -100,7 +104,7 @@ def _check(m: PolicyMetadata) -> None:
         raise ValueError(f"format is {quoted(m.format)}; this cotap reads {FORMAT!r}")
     for name in ("robot", "stage", "checkpoint_sha256", "cotap_version"):
         _require(isinstance(getattr(m, name), str), name, "a text", getattr(m, name))
-    for name in ("action", "observation", "gait", "commands", "terminations", "law"):
+    for name in ("action", "observation", "gait", "commands", "terminations", "law", "golden"):
         _require(isinstance(getattr(m, name), dict), name, "an object", getattr(m, name))
     names = isinstance(m.joints, list) and all(isinstance(joint, str) for joint in m.joints)
     _require(names and len(set(m.joints)) == len(m.joints) > 0, "joints", "a list of different names", m.joints)
@@ -115,6 +119,8 @@ def _check(m: PolicyMetadata) -> None:
             raise ValueError(f"metadata {part} lacks {absent[0]!r}")
     _check_action(m.action, len(m.joints))
     _check_observation(m.observation)
+    for name, count in (("observation", m.observation_width), ("joint_targets", len(m.joints))):
+        _check_numbers(f"golden.{name}", m.golden.get(name), count, "numbers")
 
 
 def _check_action(action: dict[str, Any], joints: int) -> None:
@@ -136,9 +142,13 @@ def _check_observation(observation: dict[str, Any]) -> None:
 
 
 def _check_per_joint(name: str, values: Any, count: int) -> None:
+    _check_numbers(name, values, count, "joints")
+
+
+def _check_numbers(name: str, values: Any, count: int, of: str) -> None:
     _require(isinstance(values, list), name, "a list", values)
     if len(values) != count:
-        raise ValueError(f"metadata {name} has {len(values)} entries for {count} joints")
+        raise ValueError(f"metadata {name} has {len(values)} entries for {count} {of}")
     if not all(is_finite(v) for v in values):
         raise ValueError(f"metadata {name} holds what is not a finite number: {quoted(values)}")
 

@@ -1,0 +1,69 @@
+"""What a robot must put into each term of the observation: quantity, unit, range; and a moment worked out."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+
+from cotap.envs import HumanoidEnvConfig
+from cotap.envs.observations import Term
+from cotap.robots import RobotSpec
+
+
+def about_terms(cfg: HumanoidEnvConfig, spec: RobotSpec, terms: tuple[Term, ...]) -> dict[str, dict[str, Any]]:
+    """For each term `what` it is, its `unit` and its `range`, before it is multiplied by its scale.
+
+    A range is (low, high), each one number or one for every joint: that of training for commands, what can be for the
+    rest, null where there is no bound.
+    """
+    joints, arms, c = spec.joints, spec.joints[len(spec.lower_joints) :], cfg.commands
+    low, high = ([j.range_rad[i] for j in arms] for i in (0, 1))
+    limits = [cfg.torque_limit_scale * j.torque_limit_nm for j in arms]
+    speeds = [j.velocity_limit_rad_s for j in joints]
+    moved = [[j.range_rad[i] - j.default_rad for j in joints] for i in (0, 1)]
+    velocity = [list(bounds) for bounds in zip(c.velocity_x, c.velocity_y, strict=True)]
+    height = [spec.nominal_height_m + offset for offset in c.height_offset]
+    about: dict[str, tuple[str, str, Any]] = {
+        "torso_angular_velocity": ("of the torso link, in its own frame: x, y, z", "rad/s", None),
+        "projected_gravity": ("unit vector that points down, in the torso link's frame", "1", [-1.0, 1.0]),
+        "command_velocity": ("commanded velocity, forward and leftward, heading frame", "m/s", velocity),
+        "command_yaw_rate": ("commanded turning rate, positive to the left", "rad/s", list(c.yaw_rate)),
+        "command_stand": ("1 stands, 0 walks", "1", [0.0, 1.0]),
+        "command_height": ("commanded height of the torso link's origin above the ground, absolute", "m", height),
+        "reference_arm_position": ("angles that the arms are to have, absolute", "rad", [low, high]),
+        "joint_position": ("joint angles minus the default pose", "rad", moved),
+        "joint_velocity": ("joint rates", "rad/s", [[-v for v in speeds], speeds]),
+        "last_action": ("action of the step before", "1", [-cfg.actions.clip, cfg.actions.clip]),
+        "sin_phase": ("sine of the gait's phase; 0 while standing", "1", [-1.0, 1.0]),
+        "cos_phase": ("cosine of the gait's phase; 0 while standing", "1", [-1.0, 1.0]),
+        "arm_torque": ("torque of the arms' law at present, within limits", "Nm", [[-t for t in limits], limits]),
+    }
+    return {name: dict(zip(("what", "unit", "range"), about[name], strict=True)) for name, _, _ in terms}
+
+
+def golden_moment(
+    spec: RobotSpec, terms: tuple[Term, ...], history: int, seed: int
+) -> tuple[dict[str, list[float]], torch.Tensor]:
+    """Readings of the first step of a robot that is asked to stand, and the observation (W,) that they make.
+
+    Readings are `joint_pos` and `joint_vel` (J,), `angular_velocity` (3,) and `gravity` (3,) of the torso. The arms'
+    reference is the default pose.
+    """
+    rng = torch.Generator().manual_seed(seed)
+    default = torch.tensor([j.default_rad for j in spec.joints], dtype=torch.float64)
+    moved, rates, turn, tilt = (
+        [round(v, 4) for v in (scale * (2.0 * torch.rand(n, generator=rng) - 1.0)).tolist()]
+        for n, scale in ((len(default), 0.1), (len(default), 0.5), (3, 0.3), (2, 0.1))
+    )
+    gravity = [*tilt, -math.sqrt(1.0 - tilt[0] ** 2 - tilt[1] ** 2)]
+    position = (default + torch.tensor(moved, dtype=torch.float64)).tolist()
+    values = {
+        "torso_angular_velocity": turn, "projected_gravity": gravity, "command_stand": [1.0],
+        "command_height": [spec.nominal_height_m], "reference_arm_position": default[len(spec.lower_joints) :].tolist(),
+        "joint_position": moved, "joint_velocity": rates,
+    }  # fmt: skip
+    rows = [scale * torch.tensor(values.get(name, [0.0] * width)).repeat(history) for name, width, scale in terms]
+    readings = {"joint_pos": position, "joint_vel": rates, "angular_velocity": turn, "gravity": gravity}
+    return readings, torch.cat(rows)
