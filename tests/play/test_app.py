@@ -77,6 +77,25 @@ def test_a_push_is_made_of_what_was_accepted_and_notices_say_what_was_not(app, n
     assert app.panel._push((0.0, 0.0, -1.0)) == Push("right", (0.0, 0.0, -600.0), 0.1)
 
 
+def test_a_control_that_does_nothing_at_present_says_so_once(app, notices):
+    for value in (0.2, 0.3, 0.4):  # a slider is many values
+        app.mailbox.set("velocity_x", value)
+        app.advance()
+    assert notices == ["forward [m/s]: the robot stands; untick stand to let it walk"]
+    app.mailbox.set("velocity_x", 0.0)
+    app.mailbox.set("stand", False)
+    app.mailbox.set("yaw_rate", 0.3)
+    app.advance()
+    assert len(notices) == 1
+    app.mailbox.set("a.left.law", "pd")
+    app.mailbox.set("a.left.alpha", 0.4)
+    app.mailbox.set("a.right.alpha", 0.4)
+    app.advance()
+    app.mailbox.set("a.left.stiffness_x", 400.0)
+    app.advance()
+    assert notices[1:] == ["alpha does nothing under pd", "K_ee x [N/m] does nothing under pd"]
+
+
 def test_a_drag_out_of_reach_gets_one_notice(app, notices):
     def drag(phase, *point):
         event = SimpleNamespace(instance_index=1, phase=phase, end_position=point, client=None)
@@ -240,7 +259,10 @@ def test_what_cannot_be_shown_is_refused_before_anything_runs(free_port, tmp_pat
     assert main(["--port", str(free_port), "--replay", str(tmp_path / "none.npz")]) == 2
     assert main(["--port", str(free_port), "--checkpoint", str(tmp_path / "none.pt")]) == 2
     assert main(["--port", str(free_port), "--robot", "atlas"]) == 2
-    err = capsys.readouterr().err
+    assert main(["--port", str(free_port), "--checkpoint", "h1-base", str(tmp_path / "none-either.pt")]) == 2
+    out, err = capsys.readouterr()
+    assert "open http" not in out
+    assert "none-either.pt" in err
     assert "none.npz" in err
     assert "none.pt" in err
     assert "robot 'atlas' is unknown" in err
@@ -250,7 +272,15 @@ def test_what_cannot_be_shown_is_refused_before_anything_runs(free_port, tmp_pat
     assert main(["--port", str(free_port), "--checkpoint", "policy.pt", "--robot", "h1"]) == 2
     assert "leave out --robot with --checkpoint" in capsys.readouterr().err
     assert main(["--port", str(free_port), "--robot", "made-up"]) == 2  # nobody trains it
-    assert "no policy of robot 'made-up' is shipped" in capsys.readouterr().err
+    out, err = capsys.readouterr()
+    assert "no policy of robot 'made-up' is shipped" in err
+    assert "open http" not in out
+
+
+def test_checkpoints_of_two_robots_are_refused(free_port, tmp_path, capsys):
+    paths = [str(save_random_policy(tmp_path / f"{robot}.pt", robot=robot)) for robot in ("h1", "made-up")]
+    assert main(["--port", str(free_port), "--checkpoint", *paths]) == 2
+    assert f"checkpoint {paths[1]!r} is of robot 'made-up', the first one of 'h1'" in capsys.readouterr().err
 
 
 def test_a_checkpoint_brings_its_robot_and_comes_before_the_shipped_policies(server, tmp_path, monkeypatch):

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from viser import transforms as tf
 
 from cotap.play import ROBOTS
 from cotap.play.archive import Archive
@@ -51,6 +52,13 @@ def drawn_hands(scene):
     return int((scene.hands.batched_scales[:, 0] > 0.9 * HAND_M).sum())
 
 
+def drawn_arrows(scene):
+    """Of every hand of every robot, whether an arrow points at it."""
+    shafts, heads = ((handle.batched_scales > 1e-3).all(1).tolist() for handle in (scene._shafts, scene._heads))
+    assert shafts == heads
+    return shafts
+
+
 def drawn_bodies(scene):
     """Of the first body that moves, as many as robots are drawn."""
     group = scene._robots._mesh_groups[0]
@@ -94,6 +102,29 @@ def test_before_anything_is_recorded_there_is_nothing_to_film(archive, scene):
     assert archive.notices == ["record something first"]
 
 
+@pytest.mark.parametrize("force", [(30.0, 0.0, 0.0), (0.0, 0.0, -30.0), (0.0, 0.0, 30.0), (10.0, -20.0, 5.0)])
+def test_the_arrow_of_the_first_push_is_whole_and_ends_at_the_hand(scene, record, force):
+    """Before it, no part of an arrow is seen; heads and shafts wait at the hands."""
+    (before,), (pushed,) = samples_of(record(1, 1)), samples_of(record(1, 1))
+    before["hand_force_w"][:] = pushed["hand_force_w"][:] = 0.0
+    pushed["hand_force_w"][0, 0] = force
+    scene.show(before)
+    assert drawn_arrows(scene) == [False] * 4
+    scene.show(pushed)
+    assert drawn_arrows(scene) == [True, False, False, False]
+    hand = pushed["hand_w"][0, 0] + scene._offset[0]
+    along = np.array(force) / np.linalg.norm(force)
+    turns = [tf.SO3(handle.batched_wxyzs[0].astype(float)) for handle in (scene._shafts, scene._heads)]
+    for turn in turns:
+        np.testing.assert_allclose(turn.as_matrix()[:, 2], along, atol=1e-5)
+    # A head reaches from its base by its length, a shaft by half of it either way.
+    head, shaft = (handle.batched_positions[0] for handle in (scene._heads, scene._shafts))
+    head_length, shaft_length = (handle.batched_scales[0, 2] for handle in (scene._heads, scene._shafts))
+    np.testing.assert_allclose(head + head_length * along, hand, atol=1e-5)
+    np.testing.assert_allclose(shaft + 0.5 * shaft_length * along, head, atol=1e-5)
+    assert shaft_length == pytest.approx(0.004 * np.linalg.norm(force), rel=1e-4)
+
+
 def test_a_sample_of_one_robot_is_drawn_alone_where_two_are_asked_for(scene, record):
     (sample,) = samples_of(record(1, 1))
     sample["hand_force_w"][0, 0] = (20.0, 0.0, 0.0)
@@ -101,7 +132,7 @@ def test_a_sample_of_one_robot_is_drawn_alone_where_two_are_asked_for(scene, rec
     scene.show(sample)
     assert drawn_hands(scene) == 2
     assert len(drawn_bodies(scene)) == 1
-    assert len(scene._arrows.points) == 1
+    assert drawn_arrows(scene) == [True, False, False, False]
     for ellipsoids in (scene._commanded, scene._effective):
         assert ((ellipsoids.batched_scales > 1e-3).all(1)).tolist() == [True, True, False, False]
     # The robot is in the middle, as it is when it is alone on the page.

@@ -30,7 +30,8 @@ class PlayOptions:
     port: int = 8080
     """Port to listen at."""
     checkpoint: tuple[str, ...] = ()
-    """Checkpoints of one robot to choose from beside its shipped ones; the first of these runs at first."""
+    """Checkpoints of one robot, files or names of shipped ones, to choose from beside its shipped ones; the first of
+    these runs at first."""
     robot: str = ""
     """Robot whose shipped policies run, by default h1. Checkpoints and recordings have their own."""
     replay: str = ""
@@ -69,11 +70,14 @@ def _run(options: PlayOptions) -> int:
     token = new_token(options.host)
     server = open_server(options.host, options.port, token)
     try:
-        # The page answers while torch, the policy and the model are still being loaded.
         loading = server.gui.add_markdown("Loading the simulation ...")
-        print(f"open {page_url(options.host, options.port, token)}", flush=True)
+        given = bool(options.replay or options.checkpoint or options.robot)
+        if not given:  # the page answers while torch, the policy and the model are still being loaded
+            print(f"open {page_url(options.host, options.port, token)}", flush=True)
         with uncollected():
             app = _replay(options, server) if options.replay else _live(options, server)
+        if given:  # what was given can be shown
+            print(f"open {page_url(options.host, options.port, token)}", flush=True)
         loading.remove()
         print(f"ready after {time.perf_counter() - begin:.1f} s; Ctrl-C ends it", flush=True)
         app.run()
@@ -86,7 +90,7 @@ def _live(options: PlayOptions, server: ViserServer) -> App:
     from cotap.play.scene import Scene
     from cotap.robots import ROBOTS as KNOWN_ROBOTS
 
-    robot = _robot_of(options.checkpoint[0]) if options.checkpoint else options.robot or "h1"
+    robot = _robot_of(options.checkpoint) if options.checkpoint else options.robot or "h1"
     require_one_of("robot", robot, KNOWN_ROBOTS)
     scene = Scene(server, KNOWN_ROBOTS[robot](), len(ROBOTS))
     server.flush()  # browsers prepare it while the rest is loaded
@@ -95,22 +99,29 @@ def _live(options: PlayOptions, server: ViserServer) -> App:
 
     import_tensordict()  # before what would import it whole
 
+    from cotap.evaluation.policy import find_checkpoint
     from cotap.play.app import App
     from cotap.play.session import Session
 
     torch.set_num_threads(1)  # two robots: more would only wait for each other
-    checkpoints = {path: Path(path) for path in options.checkpoint} | _shipped_policies(robot)
+    checkpoints = {name: find_checkpoint(name) for name in options.checkpoint} | _shipped_policies(robot)
     if not checkpoints:
         raise ValueError(f"no policy of robot {robot!r} is shipped; train one, and give it with --checkpoint")
     return App(server, scene, Session(checkpoints, options.seed), Path(options.output))
 
 
-def _robot_of(checkpoint: str) -> str:
+def _robot_of(checkpoints: tuple[str, ...]) -> str:
+    """The robot of all these. Raises ValueError if one cannot be used, or is of another robot."""
     import_tensordict()
 
-    from cotap.evaluation.policy import load_policy
+    from cotap.evaluation.policy import find_checkpoint, load_policy
 
-    return load_policy(checkpoint).env_config.robot
+    robots = {name: load_policy(find_checkpoint(name)).env_config.robot for name in checkpoints}
+    first = robots[checkpoints[0]]
+    for name, robot in robots.items():
+        if robot != first:
+            raise ValueError(f"checkpoint {name!r} is of robot {robot!r}, the first one of {first!r}")
+    return first
 
 
 def _shipped_policies(robot: str) -> dict[str, Path]:

@@ -49,6 +49,7 @@ class App:
         self._recorder: Recorder | None = None
         self._changes: dict[str, Any] = {}
         self._noticed: set[str] = set()
+        self._idle: set[str] = set()
         self._latest: tuple[int, Sample] | None = None
         with server.atomic():
             self.panel = Panel(server, self.mailbox, session.sides, self.notices)
@@ -82,6 +83,7 @@ class App:
             self.panel.put_back({name: self.session.values[name] for name in values if name in self.session.values})
         for notice in notices:
             self.notices.tell(notice, title="not possible")
+        self._tell_without_effect(changes)
         for robot in ROBOTS:
             checkpoint = changes.get(f"{robot}.checkpoint")
             if checkpoint and (text := self.session.trained_otherwise(checkpoint)):
@@ -105,6 +107,15 @@ class App:
             return
         self._step()
         self.pace.wait(self.session.values["speed"])
+
+    def _tell_without_effect(self, changes: dict[str, Any]) -> None:
+        """Say of a control that does nothing at present that it does; a slider's many values are told of once."""
+        if any(name == "stand" or name.endswith(".law") for name in changes):
+            self._idle.clear()
+        for name in changes:
+            if name not in self._idle and (text := self.session.without_effect(name)):
+                self._idle.add(name)
+                self.notices.tell(text, title="no effect")
 
     def _step(self) -> None:
         session = self.session

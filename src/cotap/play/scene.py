@@ -26,6 +26,8 @@ ARROW_M = 0.004
 """Length of a force's arrow per force [m/N]."""
 ARROW_MAX_M = 1.5
 """Longest arrow [m]."""
+SHAFT_RADIUS_M, HEAD_RADIUS_M, HEAD_LENGTH_M = 0.012, 0.03, 0.06
+"""Of an arrow [m]."""
 HAND_M, REFERENCE_M = 0.055, 0.04
 """Radii of the balls at hands and at their references [m]."""
 HIDDEN = 1e-6
@@ -62,9 +64,9 @@ class Scene:
         self._references = self._batch("references", ball, REFERENCE, REFERENCE_M)
         self._effective = self._batch("effective", trimesh.creation.icosphere(subdivisions=3), EFFECTIVE, 0.0, 0.35)
         self._commanded = self._batch("commanded", ball, COMMANDED, 0.0, wireframe=True)
-        self._arrows = server.scene.add_arrows(
-            "/forces", np.zeros((1, 2, 3)), FORCE, shaft_radius=0.012, head_radius=0.03, head_length=0.06, visible=False
-        )
+        # Not viser's own arrows: when they are first shown, their heads lie where they were made.
+        self._shafts = self._batch("force_shafts", trimesh.creation.cylinder(radius=1.0, height=1.0), FORCE, 0.0)
+        self._heads = self._batch("force_heads", trimesh.creation.cone(radius=1.0, height=1.0), FORCE, 0.0)
         self._contact_points = server.scene.add_point_cloud(
             "/contacts", np.zeros((1, 3)), CONTACT, point_size=0.025, point_shape="circle", visible=False
         )
@@ -148,16 +150,23 @@ class Scene:
             handle.batched_scales = _batched(np.maximum(size, HIDDEN))
 
     def _show_forces(self, s: Sample, shown: int) -> None:
-        force = s["hand_force_w"][:shown].reshape(-1, 3)
-        size = np.linalg.norm(force, axis=1)
-        on = size > 0.1
-        self._arrows.visible = bool(on.any())
-        if on.any():
-            tip = (s["hand_w"] + self._offset[:, None])[:shown].reshape(-1, 3)[on]
-            length = np.minimum(ARROW_M * size[on] + 0.06, ARROW_MAX_M)
-            # The arrow ends where it pushes.
-            start = tip - force[on] / size[on, None] * length[:, None]
-            self._arrows.points = np.stack((start, tip), 1).astype(np.float32)
+        force = s["hand_force_w"].reshape(-1, 3)
+        size = np.linalg.norm(force, axis=1, keepdims=True)
+        on = (size > 0.1) & (np.arange(len(force)) < shown * self._hands)[:, None]
+        along = np.where(on, force / np.maximum(size, 0.1), (0.0, 0.0, 1.0))
+        tip = (s["hand_w"] + self._offset[:, None]).reshape(-1, 3)
+        shaft = np.minimum(ARROW_M * size, ARROW_MAX_M - HEAD_LENGTH_M)
+        turn = _turned_from_z(along)
+        # The arrow ends where it pushes.
+        base = tip - HEAD_LENGTH_M * along
+        for handle, position, radius, length in (
+            (self._shafts, base - 0.5 * shaft * along, SHAFT_RADIUS_M, shaft),
+            (self._heads, base, HEAD_RADIUS_M, np.full_like(size, HEAD_LENGTH_M)),
+        ):
+            scale = np.concatenate((np.full((len(force), 2), radius), length), 1)
+            handle.batched_positions = position.astype(np.float32)
+            handle.batched_wxyzs = turn
+            handle.batched_scales = np.where(on, np.maximum(scale, HIDDEN), HIDDEN).astype(np.float32)
 
     def _show_contacts(self, contacts: list[np.ndarray]) -> None:
         points = [c + self._offset[i] for i, c in enumerate(contacts)]
@@ -170,3 +179,12 @@ class Scene:
 def _batched(values: np.ndarray) -> np.ndarray:
     """(N, H, 3) as browsers take it, (N H, 3)."""
     return values.reshape(-1, 3).astype(np.float32)
+
+
+def _turned_from_z(along: np.ndarray) -> np.ndarray:
+    """Quaternions (N, 4), w first, of the shortest turns from z to unit vectors (N, 3); a half turn about x where they
+    point down."""
+    x, y, z = along.T
+    turn = np.stack((1.0 + z, -y, x, np.zeros_like(z)), 1)
+    turn[z < -1.0 + 1e-9] = (0.0, 1.0, 0.0, 0.0)
+    return (turn / np.linalg.norm(turn, axis=1, keepdims=True)).astype(np.float32)

@@ -13,7 +13,7 @@ import torch
 from cotap.agents.actors import as_dict
 from cotap.agents.checkpoint import require_layout, sha256
 from cotap.compliance.interface import Arms
-from cotap.compliance.laws import LAWS, LawConfig
+from cotap.compliance.laws import LAWS, LawConfig, reads
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.scripted_forces import ForceProfile
 from cotap.evaluation.policy import Policy, load_policy
@@ -27,6 +27,12 @@ from cotap.play.sample import Sample, take_sample
 
 DOMAIN = ("friction", "mass_scale")
 """What is a robot's own from the start, beside its laws."""
+VELOCITIES = ("velocity_x", "velocity_y", "yaw_rate")
+"""Commands that wait while robots stand."""
+LAW_FIELDS = {f"stiffness_{axis}": "stiffness" for axis in AXES} | {
+    name: name for name in ("null_stiffness", "alpha", "error", "damping")
+}
+"""Controls of an arm, with the field of its law that each sets."""
 
 
 class Session:
@@ -88,6 +94,16 @@ class Session:
                 self.values[name] = before
                 notices.append(str(error))
         return notices
+
+    def without_effect(self, name: str) -> str:
+        """Why a value does nothing at present, for people; empty if it does something."""
+        label, head, *rest = self.controls[name].label, *name.split(".")
+        if name in VELOCITIES and self.values["stand"] and self.values[name] != 0.0:
+            return f"{label}: the robot stands; untick stand to let it walk"
+        if head in ROBOTS and rest[0] in self.sides and rest[1] in LAW_FIELDS:
+            law = self.values[f"{head}.{rest[0]}.law"]
+            return "" if reads(law, LAW_FIELDS[rest[1]]) else f"{label} does nothing under {law}"
+        return ""
 
     def trained_otherwise(self, checkpoint: str) -> str:
         """A notice if a checkpoint was trained with another stride than the first one, whose environment runs here."""
