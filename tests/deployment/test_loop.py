@@ -398,6 +398,31 @@ def test_bad_options_are_named(arguments, message, policy_file, capsys):
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("option", [["--episode-seconds", "5"], ["--arm-motion", "random"]])
+def test_what_a_scenario_says_itself_is_not_asked_for_beside_it(option, policy_file, tmp_path, capsys):
+    (tmp_path / "s.toml").write_text("seconds = 0.1\n")
+    assert deploy(["--policy", str(policy_file), "--scenario", str(tmp_path / "s.toml"), *option]) == 2
+    assert "do nothing with --scenario" in capsys.readouterr().err
+
+
+def test_a_law_of_a_scenario_reads_its_fields(policy_file, tmp_path, capsys):
+    (tmp_path / "s.toml").write_text('seconds = 0.1\nleft = "facet:alpha=0.5"\n')
+    assert deploy(["--policy", str(policy_file), "--scenario", str(tmp_path / "s.toml")]) == 2
+    assert "facet does not read alpha" in capsys.readouterr().err
+
+
+def test_that_there_is_no_renderer_is_found_before_the_trials(policy_file, tmp_path, capsys, monkeypatch):
+    import mujoco
+
+    def broken(*_):
+        raise RuntimeError("no GL")
+
+    monkeypatch.setattr(mujoco, "Renderer", broken)
+    monkeypatch.setattr("cotap.deployment.trials.run_trials", None)
+    assert deploy(["--policy", str(policy_file), "--video", str(tmp_path / "film.mp4")]) == 2
+    assert "cannot render here (no GL)" in capsys.readouterr().err
+
+
 def _edited(policy_file, tmp_path, name, value):
     proto = onnx.load(policy_file)
     next(p for p in proto.metadata_props if p.key == name).value = json.dumps(value)

@@ -123,6 +123,19 @@ def test_the_video_is_of_the_laws_that_were_asked_for(
     assert not filmed[0].singularity_ratio
 
 
+def test_the_tour_is_filmed_with_the_arms_as_they_were_evaluated(
+    tmp_path: Path, checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+):
+    filmed = []
+    monkeypatch.setattr("cotap.evaluation.render.require_renderer", lambda: None)
+    monkeypatch.setattr("cotap.evaluation.render.tour_video", lambda *args: filmed.append(args[-1]))
+    options = ("--num-envs", "2", "--episode-seconds", "5", "--video", str(tmp_path / "tour.mp4"))
+    run(tmp_path, checkpoint, *options)
+    run(tmp_path, checkpoint, *options, "--motion", "none", "--arm-pose", "0.1", "0.2", "0.3", "0.4")
+    assert filmed[0] is None
+    assert filmed[1].tolist() == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.1, -0.2, -0.3, 0.4])
+
+
 @pytest.mark.parametrize("protocol", ["velocity-tracking", "static-stiffness", "stability"])
 def test_that_there_is_no_renderer_is_found_before_the_work(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, protocol: str

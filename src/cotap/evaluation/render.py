@@ -170,12 +170,17 @@ def contact_sheet(path: Path, frames: list[np.ndarray], columns: int) -> None:
     write_atomically(path, lambda p: imageio.imwrite(p, np.concatenate(rows, 0), format="png"))  # pyright: ignore
 
 
-def record_tour(cfg: HumanoidEnvConfig, policy: PolicyFunction, seed: int = 0) -> tuple[HumanoidEnv, torch.Tensor]:
-    """One nominal robot on the tour. Returns the environment and its `qpos` (T, nq) at every control step."""
+def record_tour(
+    cfg: HumanoidEnvConfig, policy: PolicyFunction, arm_pose: torch.Tensor | None = None, seed: int = 0
+) -> tuple[HumanoidEnv, torch.Tensor]:
+    """One nominal robot on the tour, its arms held at `arm_pose` (U,) if there is one. Returns the environment and its
+    `qpos` (T, nq) at every control step."""
     disable_disturbances(cfg)
     cfg.num_envs, cfg.seed, cfg.backend = 1, seed, "mjbatch"
     cfg.terminations.episode_s = 1e4
     env = HumanoidEnv(cfg)
+    if arm_pose is not None:
+        env.motions.hold(arm_pose)
     rows: list[torch.Tensor] = []
     nominal = env.spec.nominal_height_m
     obs = env.get_observations()
@@ -189,12 +194,15 @@ def record_tour(cfg: HumanoidEnvConfig, policy: PolicyFunction, seed: int = 0) -
     return env, torch.stack(rows)
 
 
-def tour_video(path: Path, cfg: HumanoidEnvConfig, policy: PolicyFunction, sheet: Path | None = None) -> None:
-    """Write a video (and a contact sheet) of the tour.
+def tour_video(
+    path: Path, cfg: HumanoidEnvConfig, policy: PolicyFunction, sheet: Path | None = None,
+    arm_pose: torch.Tensor | None = None,
+) -> None:  # fmt: skip
+    """Write a video (and a contact sheet) of the tour; see `record_tour`.
 
     Raises:
         RenderingUnavailable: there is no OpenGL to be had.
     """
-    env, qpos = record_tour(cfg, policy)
+    env, qpos = record_tour(cfg, policy, arm_pose)
     part = qpos[::STRIDE]
     write_film(path, render_frames(env.spec, part), len(part), env.dt, sheet)

@@ -14,7 +14,7 @@ from cotap.checks import require_one_of, require_range
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.hand_loads import HandLoadConfig
 from cotap.evaluation.metrics import summaries, tracking_measures, tracking_slopes
-from cotap.evaluation.protocol import HELD, RolloutProtocol
+from cotap.evaluation.protocol import HELD, RolloutProtocol, mirrored_pose
 from cotap.evaluation.report import plot_tracking
 from cotap.evaluation.rollout import PolicyFunction, Trajectory
 from cotap.robots.mjcf import COLLISIONS
@@ -111,4 +111,5 @@ class VelocityTracking(RolloutProtocol):
         """Write a video of one robot on a tour of commands, and a contact sheet."""
         from cotap.evaluation.render import tour_video
 
-        tour_video(path, copy.deepcopy(env.cfg), policy, sheet)
+        pose = mirrored_pose(env, self.arm_pose) if self.arms == "held" else None
+        tour_video(path, copy.deepcopy(env.cfg), policy, sheet, pose)
