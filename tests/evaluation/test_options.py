@@ -59,6 +59,7 @@ def test_an_option_has_one_name_and_one_default(protocol):
     # How long an evaluation takes, how many robots there are and what stiffness is tried have one name.
     assert not {"seconds", "repeats", "worlds", "stiffness_levels"} & options.keys()
     assert MISSING not in options.values()
+    assert len(options.get("force", (0.0, 0.0, 0.0))) == 3  # along the axes; the size of one is `force_size`
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)

@@ -67,7 +67,7 @@ def run(robot, **fields):
 
 
 def test_who_falls_has_not_completed(robot):
-    t, result = run(robot, force=600.0, waypoints=2, leg=0.1, turn=0.0, radius=10.0, episode_seconds=4.0)
+    t, result = run(robot, force_size=600.0, waypoints=2, leg=0.1, turn=0.0, radius=10.0, episode_seconds=4.0)
     fell = t.fell.any(0)  # nobody steers the legs
     assert fell.any()
     assert result["completion_rate"] == pytest.approx(float((~fell).float().mean()))
@@ -77,7 +77,7 @@ def test_who_falls_has_not_completed(robot):
 @pytest.mark.parametrize(
     ("options", "message"),
     [(["--mode", "stance"], "punches are for walking"), (["--waypoints", "0"], "waypoints"), (["--leg", "0"], "leg"),
-     (["--force", "-1"], "punches.force_n")],
+     (["--force-size", "-1"], "punches.force_n")],
 )  # fmt: skip
 def test_bad_options_are_named(options, message, capsys):
     assert main(["punches", *options]) == 2

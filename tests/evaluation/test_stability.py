@@ -151,7 +151,7 @@ def test_without_the_ratio_both_halves_are_without_it(spec, checkpoint, tmp_path
 
 @pytest.mark.parametrize(
     ("option", "message"),
-    [("--poses=0", "poses"), ("--walls=-1", "walls[0]"), ("--num-envs=1", "num_envs"), ("--force=0", "force"),
+    [("--poses=0", "poses"), ("--walls=-1", "walls[0]"), ("--num-envs=1", "num_envs"), ("--force-size=0", "force_size"),
      ("--change-factor=0.5", "change_factor"), ("--frequency", "frequency[1]")],
 )  # fmt: skip
 def test_bad_options_are_named(option, message, capsys):

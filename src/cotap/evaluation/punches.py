@@ -28,7 +28,7 @@ class PunchWalk(Scenario):
     """walking; what a robot does that is to get anywhere."""
     speed: float = 0.7
     """Forward command towards a waypoint that lies ahead [m/s]."""
-    force: float = 600.0
+    force_size: float = 600.0
     """Largest push [N]; pushes are uniform between 0 and this, in random directions."""
     duration: float = 0.08
     """How long a push lasts [s]."""
@@ -56,7 +56,7 @@ class PunchWalk(Scenario):
         self._punches().check()
 
     def _punches(self) -> PunchConfig:
-        return PunchConfig(self.force, self.duration, self.episode_seconds / self.waypoints)
+        return PunchConfig(self.force_size, self.duration, self.episode_seconds / self.waypoints)
 
     @property
     def seconds(self) -> float:

@@ -45,7 +45,7 @@ class Stability(Protocol):
     """Length of a trial [s]."""
     settle_seconds: float = 6.0
     """Rest before it [s]."""
-    force: float = 10.0
+    force_size: float = 10.0
     """Amplitude of the swinging force on each hand, in a random direction [N]."""
     frequency: tuple[float, float] = (0.2, 8.0)
     """Of the force, log-uniform [Hz]."""
@@ -64,7 +64,7 @@ class Stability(Protocol):
         require_range("load_rad", self.load_rad, 0.0, math.pi)
         require_range("episode_seconds", self.episode_seconds, 0.1, 3600.0)
         require_range("settle_seconds", self.settle_seconds, 0.1, 3600.0)
-        require_range("force", self.force, 0.1, 1000.0)
+        require_range("force_size", self.force_size, 0.1, 1000.0)
         require_range("frequency[0]", self.frequency[0], 0.01, 25.0)
         require_range("frequency[1]", self.frequency[1], self.frequency[0], 25.0)
         require_range("change_factor", self.change_factor, 1.0, 1000.0)
@@ -140,7 +140,7 @@ def swings(protocol: Stability, num_hands: int, rng: torch.Generator) -> tuple[t
     direction = torch.randn(n, num_hands, 3, generator=rng)
     low, high = (math.log(bound) for bound in protocol.frequency)
     rate = 2.0 * math.pi * uniform(rng, low, high, n, num_hands, 1).exp()
-    return protocol.force * direction / direction.norm(dim=-1, keepdim=True), rate
+    return protocol.force_size * direction / direction.norm(dim=-1, keepdim=True), rate
 
 
 def exchanged_energy(env: HumanoidEnv, protocol: Stability) -> tuple[torch.Tensor, torch.Tensor]:
