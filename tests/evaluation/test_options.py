@@ -15,9 +15,10 @@ from cotap.agents.checkpoint import load_checkpoint, save_checkpoint
 from cotap.compliance.interface import ArmState, LawParameters
 from cotap.compliance.laws import LAWS, READS, LawConfig, reads
 from cotap.configs import to_plain
-from cotap.envs import HumanoidEnvConfig
+from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.upper_body import UpperBodyConfig
 from cotap.evaluate import PROTOCOLS, arms_of, main, parse, usage
+from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.policy import load_policy
 from cotap.robots.chains import arm_model
 
@@ -60,6 +61,26 @@ def test_an_option_has_one_name_and_one_default(protocol):
     assert not {"seconds", "repeats", "worlds", "stiffness_levels"} & options.keys()
     assert MISSING not in options.values()
     assert len(options.get("force", (0.0, 0.0, 0.0))) == 3  # along the axes; the size of one is `force_size`
+
+
+@pytest.mark.parametrize("mode", ["stance", "walking"])
+@pytest.mark.parametrize("motion", [("none",), ("mixture",)])
+@pytest.mark.parametrize("name", ["impact", "constant-load", "periodic-load", "fall-curve", "punches", "modulation"])
+def test_robots_are_asked_to_stand_or_to_walk(name, motion, mode):
+    """Whatever else a protocol prepares."""
+    if name == "punches" and mode == "stance":
+        return  # refused: it is for walking
+    walking = {"speed": 0.4} if mode == "walking" else {}
+    protocol = PROTOCOLS[name](num_envs=16, motion=motion, mode=mode, **walking)
+    cfg = protocol.configure(HumanoidEnvConfig(num_threads=1))
+    cfg.upper_body = LawOptions(method="cotap").configure()
+    env = HumanoidEnv(cfg)
+    protocol.prepare(env)
+    for _ in range(250):
+        env.commands.step(env.rng)
+    expected = torch.tensor([0.4 if mode == "walking" else 0.0, 0.0, 0.0])
+    torch.testing.assert_close(env.commands.asked_velocity, expected.expand(16, 3))
+    assert (env.commands.asked_to_stand == (mode == "stance")).all()
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)

@@ -139,6 +139,7 @@ class RolloutProtocol(Protocol):
 
     def prepare(self, env: HumanoidEnv) -> None:
         """Give the arms their pose, unless they follow a motion."""
+        super().prepare(env)
         if self.arms == "held":
             env.motions.hold(mirrored_pose(env, self.arm_pose))
 
