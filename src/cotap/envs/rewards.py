@@ -227,18 +227,18 @@ class LowerRewards:
         """Squared angular velocity of the torso about its horizontal axes."""
         return s.state.torso_angular_velocity_t[:, :2].square().sum(1)
 
-    @term(1.0)
+    @term(2.0)
     def contact_schedule(s: StepRecord) -> torch.Tensor:
         """Share of feet that are on the ground, or off it, as the gait's phase asks."""
         return (s.state.foot_contact == s.desired_contact).float().mean(1)
 
-    @term(-40.0)
+    @term(-60.0)
     def swing_height(s: StepRecord) -> torch.Tensor:
         """Error of the swinging soles' height [m]; linear: the first centimetre is worth as much as the last."""
         error = s.state.foot_pos_w[:, :, 2] - swing_clearance(s.swing, s.scales.foot_clearance_m)
         return (error.abs() * ~s.desired_contact).sum(1)
 
-    @term(-4.0)
+    @term(-5.0)
     def foot_slip(s: StepRecord) -> torch.Tensor:
         """Horizontal speed of the feet that are in contact."""
         return (s.state.foot_velocity_w[:, :, :2].norm(dim=2) * s.state.foot_contact).sum(1)
