@@ -12,8 +12,6 @@ from cotap.configs import BASE_RECIPES, DISTILL_RECIPES, BaseTraining, DistillTr
 from cotap.sim import resolve_backend
 
 STAGES = ("base", "distill")
-QUICK_DISTILL_ITERATIONS = 610
-"""Of a distillation that only shows that it works; 15 M samples at 1024 envs."""
 
 RunStage = Callable[[str, list[str]], Path]
 """Trains one stage, given its name and its arguments as if typed, and returns its directory."""
@@ -37,7 +35,7 @@ class PipelineOptions:
     base_iterations: int = 0
     """Iterations of stage 1; 0 for the recipe's."""
     distill_iterations: int = 0
-    """Iterations of stage 2; 0 for the recipe's, or for 610 with --quick."""
+    """Iterations of stage 2; 0 for the recipe's."""
     seed: int = 0
     """Seed of both stages."""
     threads: int = 0
@@ -58,6 +56,11 @@ class PipelineOptions:
         if self.resume and not self.run_dir:
             raise ValueError("--resume goes on with the runs in --run-dir, which is not given")
 
+    @property
+    def recipe(self) -> str:
+        """Of both stages."""
+        return "quick" if self.quick else "default"
+
     def iterations(self) -> tuple[int, int]:
         """Of both stages."""
         base, distill = self._trainings()
@@ -65,12 +68,10 @@ class PipelineOptions:
 
     def _trainings(self) -> tuple[BaseTraining, DistillTraining]:
         """Both configurations."""
-        base = BASE_RECIPES["quick" if self.quick else "default"]()
+        base = BASE_RECIPES[self.recipe]()
         base.env.robot, base.env.num_envs, base.env.backend = self.robot, self.num_envs, self.backend
         base.env.num_threads = self.threads
-        distill = DISTILL_RECIPES["default"](base)
-        if self.quick:
-            distill.runner.iterations = QUICK_DISTILL_ITERATIONS
+        distill = DISTILL_RECIPES[self.recipe](base)
         base.runner.iterations = self.base_iterations or base.runner.iterations
         distill.runner.iterations = self.distill_iterations or distill.runner.iterations
         return base, distill
@@ -100,8 +101,7 @@ def train_both(options: PipelineOptions, run_stage: RunStage) -> Path:
     base_steps, distill_steps = options.iterations()
     if not options.resume:
         print(expected(options), flush=True)
-    recipe = ["--recipe", "quick"] if options.quick else []
-    base = _part(options, run_dir / "base", base_steps, ["--robot", options.robot, *recipe], run_stage)
+    base = _part(options, run_dir / "base", base_steps, ["--robot", options.robot], run_stage)
     _part(options, run_dir / "distill", distill_steps, ["--base-checkpoint", str(base)], run_stage)
     print(_summary(run_dir), end="")
     return run_dir
@@ -137,7 +137,7 @@ def _part(options: PipelineOptions, run_dir: Path, iterations: int, begin: list[
     run_stage(run_dir.name, [
         "--num-envs", str(options.num_envs), "--seed", str(options.seed), "--threads", str(options.threads),
         "--backend", options.backend, "--device", options.device, "--iterations", str(iterations),
-        "--run-dir", str(run_dir), *(["--resume", str(newest)] if newest else begin),
+        "--run-dir", str(run_dir), *(["--resume", str(newest)] if newest else ["--recipe", options.recipe, *begin]),
     ])  # fmt: skip
     newest = _newest(run_dir)
     assert newest, f"{run_dir} holds no checkpoint of a stage that ended"

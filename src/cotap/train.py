@@ -73,8 +73,9 @@ class DistillOptions:
     """Base policy to begin from and to be guided by, a file or the name of a shipped one; by default the shipped
     one."""
     recipe: str = "default"
-    """default (80 to 1200 N/m); paper (150 to 450 N/m); facet (arms under FACET, its tracking reward);
-    or an ablation: no-ratio, torque-critic, goals. The last two change what networks see; the base's are refitted."""
+    """default (80 to 1200 N/m); quick (its beginnings); paper (150 to 450 N/m); facet (arms under FACET, its tracking
+    reward); or an ablation: no-ratio, torque-critic, goals. The last two change what networks see; the base's are
+    refitted."""
     command: tyro.conf.Suppress[str] = ""
     training: Annotated[DistillTraining, tyro.conf.arg(name="")] = field(default_factory=DistillTraining)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import MISSING, fields
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from cotap.envs.upper_body import UpperBodyConfig
 from cotap.evaluate import PROTOCOLS, arms_of, main, parse, usage
 from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.policy import load_policy
+from cotap.evaluation.scenario import MODES
 from cotap.robots.chains import arm_model
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
@@ -63,13 +65,13 @@ def test_an_option_has_one_name_and_one_default(protocol):
     assert len(options.get("force", (0.0, 0.0, 0.0))) == 3  # along the axes; the size of one is `force_size`
 
 
-@pytest.mark.parametrize("mode", ["stance", "walking"])
 @pytest.mark.parametrize("motion", [("none",), ("mixture",)])
-@pytest.mark.parametrize("name", ["impact", "constant-load", "periodic-load", "fall-curve", "punches", "modulation"])
+@pytest.mark.parametrize(
+    ("name", "mode"),
+    [("punches", "walking"), *product(("impact", "constant-load", "periodic-load", "fall-curve", "modulation"), MODES)],
+)
 def test_robots_are_asked_to_stand_or_to_walk(name, motion, mode):
     """Whatever else a protocol prepares."""
-    if name == "punches" and mode == "stance":
-        return  # refused: it is for walking
     walking = {"speed": 0.4} if mode == "walking" else {}
     protocol = PROTOCOLS[name](num_envs=16, motion=motion, mode=mode, **walking)
     cfg = protocol.configure(HumanoidEnvConfig(num_threads=1))

@@ -80,6 +80,11 @@ def require_symmetric(name: str, matrix: torch.Tensor) -> None:
         raise ValueError(f"{name} must be symmetric, got entries that differ by {float(asymmetry.amax()):g}")
 
 
+def symmetric_part(matrix: torch.Tensor) -> torch.Tensor:
+    """Of matrices (..., n, n): without what rounding has made of them."""
+    return 0.5 * (matrix + matrix.transpose(-1, -2))
+
+
 def require_positive_definite(name: str, values: torch.Tensor, dtype: torch.dtype) -> None:
     """Raise ValueError unless ascending eigenvalues (..., n) of matrices in `dtype` are positive (see `rounding`)."""
     if not values_are_known():

@@ -20,6 +20,7 @@ from cotap.compliance.arguments import (
     require_ratio,
     require_symmetric,
     rounding,
+    symmetric_part,
     values_are_known,
 )
 
@@ -42,8 +43,8 @@ class _SpdLog(torch.autograd.Function):
     def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor, None, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
         log, values, vectors = ctx.saved_tensors
         if torch.is_grad_enabled():  # derivatives of this one are wanted
-            return _log_derivative(log, _symmetric(gradient)), None, None
-        return _last_log_derivative(values, vectors, _symmetric(gradient)), None, None
+            return _log_derivative(log, symmetric_part(gradient)), None, None
+        return _last_log_derivative(values, vectors, symmetric_part(gradient)), None, None
 
     @staticmethod
     def jvp(ctx: Any, tangent: torch.Tensor, *_: None) -> torch.Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -82,14 +83,14 @@ def _apply_log(matrix: torch.Tensor, values: torch.Tensor, vectors: torch.Tensor
 def _log(name: str, matrix: torch.Tensor) -> torch.Tensor:
     """Logarithm in float64 of the argument `name`, which is checked."""
     require_symmetric(name, matrix)
-    whole = _symmetric(matrix.double())
+    whole = symmetric_part(matrix.double())
     values, vectors = torch.linalg.eigh(whole.detach())
     require_positive_definite(name, values, matrix.dtype)
     return _apply_log(whole, values, vectors)
 
 
 def _exp(matrix: torch.Tensor) -> torch.Tensor:
-    return _symmetric(torch.linalg.matrix_exp(matrix))
+    return symmetric_part(torch.linalg.matrix_exp(matrix))
 
 
 def spd_log(matrix: torch.Tensor) -> torch.Tensor:
@@ -112,7 +113,7 @@ def spd_exp(matrix: torch.Tensor) -> torch.Tensor:
             what its dtype holds or would be refused by `spd_log`.
     """
     require_symmetric("matrix", matrix)
-    whole = _symmetric(matrix.double())
+    whole = symmetric_part(matrix.double())
     if values_are_known():
         _require_exponential(torch.linalg.eigvalsh(whole.detach()), matrix.dtype)
     return _exp(whole).to(matrix.dtype)
@@ -183,7 +184,3 @@ def modulate_stiffness(k_comp: torch.Tensor, k_pd: torch.Tensor, alpha: torch.Te
     require_ratio("alpha", ratio)
     ratio = ratio[..., None, None]
     return _exp(ratio * log_comp + (1.0 - ratio) * _log("k_pd", k_pd)).to(k_comp.dtype)
-
-
-def _symmetric(matrix: torch.Tensor) -> torch.Tensor:
-    return 0.5 * (matrix + matrix.transpose(-1, -2))

@@ -22,6 +22,7 @@ from cotap.compliance.arguments import (
     require_ratio,
     require_symmetric,
     rounding,
+    symmetric_part,
     values_are_known,
 )
 
@@ -116,7 +117,7 @@ def task_compliance(
     units = lengths.unsqueeze(-1) * lengths
     stiffness = as_matrix("task_stiffness", task_stiffness, jacobian) / units
     require_positive_definite("task_stiffness", torch.linalg.eigvalsh(stiffness.detach()), jacobian.dtype)
-    compliance = _symmetric(torch.linalg.inv(stiffness))
+    compliance = symmetric_part(torch.linalg.inv(stiffness))
     if base_compliance is None:
         return compliance
     base = as_matrix("base_compliance", base_compliance, jacobian) * units
@@ -195,7 +196,7 @@ def resolve_joint_stiffness(
     transposed = j.transpose(-1, -2)
     eye = torch.eye(j.shape[-1], dtype=j.dtype, device=j.device)
     projector = eye - transposed @ damped_gram_inverse(j) @ j
-    return _symmetric(transposed @ stiffness @ j + null[..., None, None] * projector).to(jacobian.dtype)
+    return symmetric_part(transposed @ stiffness @ j + null[..., None, None] * projector).to(jacobian.dtype)
 
 
 def require_jacobian(jacobian: torch.Tensor) -> None:
@@ -238,11 +239,7 @@ def as_matrix(name: str, value: torch.Tensor, jacobian: torch.Tensor) -> torch.T
     whole = (*diagonal, diagonal[-1])
     if tuple(value.shape) == whole:
         require_symmetric(name, value)
-        return _symmetric(value.double())
+        return symmetric_part(value.double())
     if tuple(value.shape) == diagonal:
         return torch.diag_embed(value.double())
     raise ValueError(f"{name} must have shape {diagonal}, a diagonal, or {whole}, got {tuple(value.shape)}")
-
-
-def _symmetric(matrix: torch.Tensor) -> torch.Tensor:
-    return 0.5 * (matrix + matrix.transpose(-1, -2))

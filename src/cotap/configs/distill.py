@@ -40,6 +40,13 @@ def default(base: BaseTraining) -> DistillTraining:
     return training
 
 
+def quick(base: BaseTraining) -> DistillTraining:
+    """The beginnings of compliance in the shortest time; 15 M samples."""
+    training = default(base)
+    training.runner.iterations = 610
+    return training
+
+
 def paper(base: BaseTraining) -> DistillTraining:
     """The paper's range of stiffness (its Table II), drawn uniformly, PD's damping, and its 20,000 iterations."""
     training = default(base)
@@ -91,6 +98,7 @@ def facet(base: BaseTraining) -> DistillTraining:
 
 DISTILL_RECIPES: dict[str, Callable[[BaseTraining], DistillTraining]] = {
     "default": default,
+    "quick": quick,
     "paper": paper,
     "no-ratio": without_ratio,
     "torque-critic": with_torque_for_critics,
