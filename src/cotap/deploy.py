@@ -39,6 +39,8 @@ class DeployOptions:
     """How long a trial lasts, by default 20 s; a scenario says so itself [s]."""
     arm_motion: str = ""
     """Clip that the arms follow, or `random`; empty holds the default pose. A scenario says so itself."""
+    library: str = ""
+    """Motion library (.npz) that the clip is taken from; empty for the one that comes with the package."""
     left: str = ""
     """The left arm's law, such as cotap:alpha=0.7,stiffness=500; by default the scenario's, or that of training."""
     right: str = ""
@@ -84,8 +86,8 @@ def deploy(options: DeployOptions) -> dict[str, Any]:
     require_output("--video", options.video, (".mp4",))
     if options.keyboard and (options.scenario or options.trials > 1):
         raise ValueError("--keyboard goes with neither --scenario nor --trials")
-    if options.scenario and (options.episode_seconds is not None or options.arm_motion):
-        raise ValueError("--episode-seconds and --arm-motion do nothing with --scenario: it gives them itself")
+    if options.scenario and (options.episode_seconds is not None or options.arm_motion or options.library):
+        raise ValueError("--episode-seconds, --arm-motion and --library do nothing with --scenario: it says so itself")
     if options.video:
         require_renderer()
     policy = OnnxPolicy(options.policy)
@@ -94,7 +96,7 @@ def deploy(options: DeployOptions) -> dict[str, Any]:
     if not options.scenario:
         if options.episode_seconds is not None:
             scenario.seconds = options.episode_seconds
-        scenario.arms.clip = options.arm_motion
+        scenario.arms.clip, scenario.arms.library = options.arm_motion, options.library
         scenario.check(spec)
     laws = law_config(policy.metadata)
     for side in ("left", "right"):

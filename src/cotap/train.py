@@ -153,6 +153,7 @@ def _parse_base(args: list[str]) -> BaseOptions:
         training = _resumed_config(resumed, recipe, "base", BaseTraining)
     else:
         training = BASE_RECIPES[recipe or "default"]()
+    _unpin_library(args, training)
     default = BaseOptions(recipe=recipe or "default", training=training)
     return tyro.cli(BaseOptions, args=args, default=default, prog="python -m cotap.train base")
 
@@ -173,8 +174,15 @@ def _parse_distill(args: list[str]) -> DistillOptions:
     else:
         base = base or str(shipped_checkpoint("h1-base"))
         training = DISTILL_RECIPES[recipe](_config_of(base, BaseTraining))
+    _unpin_library(args, training)
     default = DistillOptions(recipe=recipe, base_checkpoint=base, training=training)
     return tyro.cli(DistillOptions, args=args, default=default, prog="python -m cotap.train distill")
+
+
+def _unpin_library(args: list[str], training: BaseTraining | DistillTraining) -> None:
+    """Take a motion library that is given as it now is, whatever the config that is gone on from was trained with."""
+    if _peek(args, "--env.motions.clips.library"):
+        training.env.motions.clips.library_sha256 = ""
 
 
 def _resumed_config(checkpoint: str, recipe: str, stage: str, kind: type[Any]) -> Any:
@@ -245,6 +253,7 @@ def _train(stage: str, options: BaseOptions | DistillOptions, base: dict[str, An
     from cotap.agents.run_log import say
     from cotap.agents.runner import CHECKPOINT_PATTERN, DualRunner, check_run_dir, sole_writer
     from cotap.envs import HumanoidEnv
+    from cotap.motions.reference import pin_library
 
     training, ranks = options.training, Ranks.from_environment()
     resumed = Path(options.resume) if options.resume else None
@@ -255,6 +264,7 @@ def _train(stage: str, options: BaseOptions | DistillOptions, base: dict[str, An
     run_dir = Path(options.run_dir) if options.run_dir else resumed_dir or _new_run_dir(stage)
     training.env.seed, training.env.num_threads = training.seed, training.threads
     training.check()
+    pin_library(training.env.motions.clips)
     config = {"stage": stage, "training": to_plain(training), **provenance(options.command, training.env.backend)}
     config |= _origin(options)
     training.env.seed, training.env.num_threads = ranks.seed(training.seed), ranks.threads(training.threads)

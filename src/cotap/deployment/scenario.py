@@ -72,6 +72,8 @@ class ArmMotion:
     """Arm joints, left arm first [rad]."""
     clip: str = ""
     """Name of a clip in the motion library; `random` mixes clips and generated motion as in training."""
+    library: str = ""
+    """Motion library (.npz) that the clip is taken from; empty for the one that comes with the package."""
 
     def check(self, spec: RobotSpec) -> None:
         """Raise ValueError naming the first field that is out of its range."""
@@ -82,12 +84,16 @@ class ArmMotion:
         for i, (value, name) in enumerate(zip(self.pose, spec.upper_joints, strict=False)):
             joint = spec.joints[spec.indices([name])[0]]
             require_range(f"arms.pose[{i}] ({name})", value, *joint.range_rad)
-        if not isinstance(self.clip, str):
-            raise ValueError(f"arms.clip must be a name, got {quoted(self.clip)}")
+        for name in ("clip", "library"):
+            if not isinstance(getattr(self, name), str):
+                raise ValueError(f"arms.{name} must be a name, got {quoted(getattr(self, name))}")
+        if self.library and not self.clip:
+            raise ValueError(f"arms.library {self.library!r} does nothing without a clip")
 
     def reference(self, spec: RobotSpec, dt: float) -> ReferenceMotion:
         """The reference of one robot. Raises MotionError for a clip that is not there."""
         cfg = ReferenceConfig()
+        cfg.clips.library = self.library
         if self.clip != "random":
             cfg.clips.share = 1.0 if self.clip else 0.0
             cfg.clips.only = (self.clip,) if self.clip else ()

@@ -68,6 +68,8 @@ class Protocol(ABC):
         env_cfg.num_envs, env_cfg.seed, env_cfg.torque_limit_scale = self.num_envs, self.seed, self.torque_limit_scale
         env_cfg.randomization = RandomizationConfig(enabled=self.randomize)
         env_cfg.terminations = TerminationConfig(episode_s=1e6)  # what ends an episode is a fall
+        if self.arms == "held":
+            select_motion(env_cfg.motions.clips, (HELD,), "")
         return env_cfg
 
     def prepare(self, env: HumanoidEnv) -> None:  # noqa: B027  (some have nothing to prepare)
@@ -134,7 +136,8 @@ class RolloutProtocol(Protocol):
     def configure(self, env_cfg: HumanoidEnvConfig) -> HumanoidEnvConfig:
         """Turn the environment that a policy was trained in into this protocol's. Changes and returns `env_cfg`."""
         super().configure(env_cfg)
-        select_motion(env_cfg.motions.clips, self.motion, self.library)
+        if self.arms == "moving":
+            select_motion(env_cfg.motions.clips, self.motion, self.library)
         return env_cfg
 
     def prepare(self, env: HumanoidEnv) -> None:
@@ -164,7 +167,8 @@ class RolloutProtocol(Protocol):
 
 def select_motion(clips: ClipConfig, motion: tuple[str, ...], library: str) -> None:
     """Have `clips` play what `motion` and `library` say."""
-    clips.library = library or clips.library
+    if library:
+        clips.library, clips.library_sha256 = library, ""
     if motion == (HELD,):
         clips.share, clips.only = 0.0, ()
     elif motion != (MIXTURE,):

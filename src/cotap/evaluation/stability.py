@@ -15,7 +15,7 @@ from cotap.compliance.laws import LAWS, LawConfig
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.scripted_forces import ForceProfile
 from cotap.evaluation.linearization import linearize
-from cotap.evaluation.protocol import HELD, Protocol, select_motion
+from cotap.evaluation.protocol import Protocol
 from cotap.evaluation.report import heading, save_figure
 from cotap.evaluation.rollout import PolicyFunction, idle, picture_row
 from cotap.persistence import uniform
@@ -74,7 +74,6 @@ class Stability(Protocol):
         """Turn the environment that a policy was trained in into this protocol's. Changes and returns `env_cfg`."""
         super().configure(env_cfg)
         env_cfg.fixed_base = True
-        select_motion(env_cfg.motions.clips, (HELD,), "")
         env_cfg.forces.scripted = ForceProfile((1.0, 1.0, 1.0), "both", start_s=0.0)
         return env_cfg
 

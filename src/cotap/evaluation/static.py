@@ -15,7 +15,7 @@ from cotap.compliance import condition_number
 from cotap.compliance.laws import WITHOUT_STIFFNESS
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.scripted_forces import ForceProfile
-from cotap.evaluation.protocol import HELD, mirrored_pose, require_pose, select_motion
+from cotap.evaluation.protocol import mirrored_pose, require_pose
 from cotap.evaluation.report import heading, save_figure
 from cotap.evaluation.rollout import UPPER_ACTIONS, PolicyFunction, acting, picture_row
 from cotap.evaluation.scenario import Stance
@@ -51,7 +51,6 @@ class HeldLoad(Stance):
     def configure(self, env_cfg: HumanoidEnvConfig) -> HumanoidEnvConfig:
         """Turn the environment that a policy was trained in into this protocol's. Changes and returns `env_cfg`."""
         super().configure(env_cfg)
-        select_motion(env_cfg.motions.clips, (HELD,), "")
         env_cfg.forces.scripted = ForceProfile((1.0, 1.0, 1.0), self.hand, self.settle_seconds)
         return env_cfg
 

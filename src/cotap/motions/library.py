@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ import numpy as np
 
 from cotap.checks import legible, quoted
 from cotap.files import write_arrays
-from cotap.inputs import InputError, read_arrays
+from cotap.inputs import InputError, read_arrays, read_bytes
 from cotap.robots import RobotSpec
 
 FPS = 50.0
@@ -192,6 +193,14 @@ def read_npz(path: str | Path, names: Collection[str]) -> dict[str, np.ndarray]:
     """The arrays of an npz file that are called one of `names`. Raises MotionError as `read_arrays` does."""
     try:
         return read_arrays(path, names, _LARGEST_FILE)
+    except InputError as error:
+        raise MotionError(f"motion file {str(path)!r} {error}") from error
+
+
+def library_sha256(path: str | Path) -> str:
+    """Hex digest of a library's file. Raises MotionError if it cannot be read."""
+    try:
+        return hashlib.sha256(read_bytes(path, _LARGEST_FILE)).hexdigest()
     except InputError as error:
         raise MotionError(f"motion file {str(path)!r} {error}") from error
 

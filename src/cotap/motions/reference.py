@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ import torch
 from cotap.checks import require_interval, require_one_of, require_range
 from cotap.motions.clip_player import ClipPlayer
 from cotap.motions.generator import PEAK_SPEED, ArmReference, MotionConfig, MotionGenerator, minimum_jerk
-from cotap.motions.library import MotionError, MotionLibrary, has_shipped_library, shipped_library
+from cotap.motions.library import MotionError, MotionLibrary, has_shipped_library, library_sha256, shipped_library
 from cotap.motions.pace import pace
 from cotap.persistence import Stateful, uniform
 from cotap.robots import RobotSpec
@@ -30,6 +31,8 @@ class ClipConfig:
     library: str = ""
     """A motion library (.npz); empty takes the one that comes with the package for the robot. Where there is none, and
     `only` is empty too, all is left to the generator."""
+    library_sha256: str = ""
+    """Hex digest of that library; one with another is refused. Empty takes any, and a training fills it in."""
     only: tuple[str, ...] = ()
     """Play these clips; empty plays all but `held_out`."""
     held_out: tuple[str, ...] = ("dance_b", "dance_b_mirrored", "kick", "kick_mirrored")
@@ -74,8 +77,22 @@ def plays_clips(cfg: ClipConfig, spec: RobotSpec) -> bool:
     return cfg.share > 0.0 and bool(cfg.library or cfg.only or has_shipped_library(spec))
 
 
+def pin_library(cfg: ClipConfig) -> None:
+    """Write down where the library lies, and its digest unless there is one: a policy is used in other folders than
+    where it was trained. Raises MotionError for a library that cannot be read."""
+    if cfg.library:
+        cfg.library = str(Path(cfg.library).absolute())
+        cfg.library_sha256 = cfg.library_sha256 or library_sha256(cfg.library)
+
+
 def load_clips(cfg: ClipConfig, spec: RobotSpec) -> MotionLibrary:
-    """The clips that a config asks for, at its pace. Raises MotionError for a library or a clip that is not there."""
+    """The clips that a config asks for, at its pace. Raises MotionError for a clip that is not there, and for a library
+    that is not there or has changed."""
+    if cfg.library and cfg.library_sha256 not in ("", library_sha256(cfg.library)):
+        raise MotionError(
+            f"motion library {cfg.library!r} has changed since the policy was trained with it; give the library that "
+            "is meant by name"
+        )
     library = MotionLibrary.load(cfg.library, spec) if cfg.library else shipped_library(spec)
     names = list(cfg.only) or [name for name in library.names() if name not in cfg.held_out]
     if not names:

@@ -34,6 +34,8 @@ class PlayOptions:
     these runs at first."""
     robot: str = ""
     """Robot whose shipped policies run, by default h1. Checkpoints and recordings have their own."""
+    library: str = ""
+    """Motion library (.npz) of the clips to choose from; empty for the first policy's."""
     replay: str = ""
     """Show this recording (.npz) instead of simulating."""
     output: str = "runs/play"
@@ -59,6 +61,8 @@ def _run(options: PlayOptions) -> int:
     begin = time.perf_counter()
     if options.replay and (options.robot or options.checkpoint):
         raise ValueError("a recording has its own robot and policies: leave out --robot and --checkpoint with --replay")
+    if options.replay and options.library:
+        raise ValueError("--library does nothing with --replay")
     if options.checkpoint and options.robot:
         raise ValueError("a checkpoint has its own robot: leave out --robot with --checkpoint")
     try:
@@ -107,7 +111,7 @@ def _live(options: PlayOptions, server: ViserServer) -> App:
     checkpoints = {name: find_checkpoint(name) for name in options.checkpoint} | _shipped_policies(robot)
     if not checkpoints:
         raise ValueError(f"no policy of robot {robot!r} is shipped; train one, and give it with --checkpoint")
-    return App(server, scene, Session(checkpoints, options.seed), Path(options.output))
+    return App(server, scene, Session(checkpoints, options.seed, options.library), Path(options.output))
 
 
 def _robot_of(checkpoints: tuple[str, ...]) -> str:

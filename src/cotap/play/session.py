@@ -17,9 +17,11 @@ from cotap.compliance.laws import LAWS, LawConfig, reads
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.scripted_forces import ForceProfile
 from cotap.evaluation.policy import Policy, load_policy
+from cotap.evaluation.protocol import MIXTURE, select_motion
 from cotap.evaluation.rollout import reference_actions
 from cotap.evaluation.undisturbed import disable_disturbances
-from cotap.motions.reference import REST
+from cotap.motions.library import MotionError, library_sha256
+from cotap.motions.reference import REST, ClipConfig
 from cotap.play import ROBOTS
 from cotap.play.controls import AXES, Control, Ranges, make_controls
 from cotap.play.forces import HandForces, Push
@@ -44,16 +46,18 @@ class Session:
     Args:
         checkpoints: Policies to choose from, by the names that are shown; the first runs at first.
         seed: Of the robots' starts.
+        library: Motion library (.npz) of the clips to choose from; empty for the first policy's.
 
     Raises:
         CheckpointError: the first checkpoint cannot be used.
+        MotionError: the library cannot.
     """
 
-    def __init__(self, checkpoints: Mapping[str, Path], seed: int = 0) -> None:
+    def __init__(self, checkpoints: Mapping[str, Path], seed: int = 0, library: str = "") -> None:
         self._checkpoints, self._seed = dict(checkpoints), seed
         first = next(iter(self._checkpoints))
         policy = load_policy(self._checkpoints[first])
-        self.env = HumanoidEnv(play_config(policy.env_config))
+        self.env = HumanoidEnv(play_config(policy.env_config, library))
         self._loaded: dict[str, Policy] = {}
         self._policies = [self._policy(first)] * len(ROBOTS)
         env = self.env
@@ -240,8 +244,10 @@ def usable_laws(arms: Arms) -> tuple[str, ...]:
     return tuple(names)
 
 
-def play_config(env_cfg: HumanoidEnvConfig) -> HumanoidEnvConfig:
+def play_config(env_cfg: HumanoidEnvConfig, library: str = "") -> HumanoidEnvConfig:
     """Turn the environment that a policy was trained in into the page's. Changes and returns `env_cfg`."""
+    select_motion(env_cfg.motions.clips, (MIXTURE,), library)
+    _find_library(env_cfg.motions.clips)
     disable_disturbances(env_cfg)
     env_cfg.num_envs, env_cfg.num_threads, env_cfg.backend = len(ROBOTS), 1, "mjbatch"
     env_cfg.terminations.episode_s = 1e6
@@ -253,3 +259,16 @@ def play_config(env_cfg: HumanoidEnvConfig) -> HumanoidEnvConfig:
                 setattr(weights, name, 0.0)
     env_cfg.forces.scripted = ForceProfile(start_s=0.0)
     return env_cfg
+
+
+def _find_library(clips: ClipConfig) -> None:
+    """Offer the clips that come with the package where a policy's own are not on this machine, or are others now."""
+    if not clips.library_sha256:  # given just now, or none
+        return
+    try:
+        same = library_sha256(clips.library) == clips.library_sha256
+    except MotionError:
+        same = False
+    if not same:
+        print(f"motion library {clips.library!r} of this policy is not here: --library names one", flush=True)
+        clips.library = clips.library_sha256 = ""
