@@ -1,34 +1,120 @@
-"""`python -m cotap` says which commands there are."""
+"""The command `cotap`: what it answers by itself, and what it hands over."""
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+from build_help import ABOUT, FILE, build
+
 import cotap
-from cotap.__main__ import COMMANDS, main
+from cotap.__main__ import main
+from cotap.command_help import Command, Option, dump_commands, load_commands, show, unknown
+
+COMMANDS = load_commands()
 
 
-def test_the_package_lists_its_commands():
-    done = subprocess.run([sys.executable, "-m", "cotap"], capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
-    for name, what in COMMANDS.items():
-        (line,) = (line for line in done.stdout.splitlines() if line.startswith(f"  python -m cotap.{name} "))
-        assert line.endswith(what)
+def test_help_is_what_the_parsers_read():
+    assert dump_commands(build()) == FILE.read_text(encoding="utf-8"), "run scripts/build_help.py"
 
 
 def test_all_commands_are_listed_and_no_other():
     package = Path(cotap.__file__).parent
     single = {file.stem for file in package.glob("*.py") if "__main__" in file.read_text() and file.stem != "__main__"}
     packages = {file.parent.name for file in package.glob("*/__main__.py")}
-    assert single | packages == COMMANDS.keys()
-    assert all(importlib.util.find_spec(f"cotap.{name}") for name in COMMANDS)
+    assert (single | packages) - {"command_help"} == ABOUT.keys() == COMMANDS[""].parts.keys()
 
 
-def test_a_command_is_a_module(capsys):
-    assert main(["evaluate"]) == 2
-    assert "run python -m cotap.evaluate" in capsys.readouterr().err
-    assert main(["dance"]) == 2
-    assert "got 'dance'; known: train, evaluate" in capsys.readouterr().err
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_fits_a_screen(name: str, capsys: pytest.CaptureFixture[str]):
+    assert main([*name.split(), "--help"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) <= 50
+    assert max(map(len, lines)) <= 80
+    assert lines[0].startswith(f"usage: cotap {name}".rstrip())
+
+
+@pytest.mark.parametrize("name", [name for name, command in COMMANDS.items() if command.options])
+def test_full_help_has_every_option_and_every_word(name: str, capsys: pytest.CaptureFixture[str]):
+    assert main([*name.split(), "--help-all"]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    for option in COMMANDS[name].options:
+        assert ", ".join(option.flags) in shown
+        assert option.help in shown
+
+
+def test_options_of_a_training_are_all_there():
+    flags = COMMANDS["train base"].flags()
+    assert {"--num-envs", "--env.num-envs", "--robot", "--seed", "--ppo.clip", "--env.rewards.lower.foot-slip"} <= {
+        *flags
+    }
+    assert "--robot" not in COMMANDS["train distill"].flags()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("dance", "unknown command 'dance'; known: train, evaluate"),
+        ("evaluat impact", "unknown command 'evaluat'; did you mean evaluate?"),
+        ("train bas", "unknown stage 'bas'; did you mean base?"),
+        ("evaluate impakt", "unknown protocol 'impakt'; did you mean impact?"),
+        ("motions shwo", "unknown command 'shwo'; did you mean show?"),
+        (
+            "evaluate impact --stifness 4",
+            "cotap evaluate impact: unknown option '--stifness'; did you mean --stiffness",
+        ),
+        ("train base --env.num-env=3", "unknown option '--env.num-env'; did you mean --env.num-envs"),
+        ("export --chekpoint x", "did you mean --checkpoint"),
+    ],
+)
+def test_what_is_not_known_is_answered_with_the_nearest(arguments: str, message: str, capsys):
+    assert main(arguments.split()) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_questions_import_nothing_heavy():
+    code = (
+        "import sys; from cotap.__main__ import main\n"
+        "for line in ('', 'train base --help', 'evaluate impakt', 'evaluate impact --help-all', 'play --x'):\n"
+        "    main(line.split())\n"
+        "heavy = {'torch', 'mujoco', 'tyro', 'scipy', 'matplotlib', 'tensordict'} & sys.modules.keys()\n"
+        "sys.exit(str(heavy) if heavy else 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr[-500:]
+
+
+def test_options_are_handed_over_as_they_were_typed(monkeypatch: pytest.MonkeyPatch):
+    """In either spelling, with a value after a sign of equality or a space, negative numbers too."""
+    seen: list[list[str]] = []
+    for name in ("evaluate", "train"):
+        module = importlib.import_module(f"cotap.{name}")
+        monkeypatch.setattr(module, "main", lambda args: seen.append(args) or 7)
+    typed = ["impact", "--num_envs=3", "--force", "-1", "0", "-2.5", "--no-randomize"]
+    assert main(["evaluate", *typed]) == 7
+    assert main(["train", "--quick"]) == 7
+    assert main(["train", "base", "--help", "--resume", "x.pt"]) == 7  # the defaults are those of the run
+    assert seen == [typed, ["--quick"], ["base", "--help", "--resume", "x.pt"]]
+
+
+def test_a_missing_package_is_named_with_its_cure(monkeypatch: pytest.MonkeyPatch, capsys):
+    monkeypatch.delitem(sys.modules, "cotap.compare", raising=False)
+    monkeypatch.setitem(sys.modules, "tyro", None)
+    assert main(["compare", "a.json", "b.json"]) == 2
+    assert "cotap compare needs tyro: pip install 'cotap[all]'" in capsys.readouterr().err
+
+
+def test_a_line_of_help_is_cut_before_its_default():
+    option = Option(("--size",), "FLOAT", "How large it is, " + "and so on, " * 20, "2.5")
+    line = show("x", Command("about", {}, (option,))).splitlines()[-3]
+    assert line.startswith("  --size FLOAT              How large it is, and")
+    assert line.endswith("... (2.5)")
+    assert len(line) <= 80
+
+
+def test_a_name_that_resembles_nothing_gets_the_list():
+    assert unknown("law", "zzz", ["pd", "cotap"]) == "unknown law 'zzz'; known: pd, cotap"
+    assert len(unknown("law", "z" * 10**6, ["pd"])) < 200

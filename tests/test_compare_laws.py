@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
+import compare_laws
 import pytest
 import torch
 from random_policy import save_random_policy
 
 from cotap.evaluation.wrong_model import misjudged_arms
 from cotap.robots.chains import arm_model
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
-import compare_laws
 
 
 def test_a_wrong_model_is_longer_and_heavier(spec):

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
+import publish
 import pytest
 import torch
 from random_policy import save_random_policy
 
 from cotap.agents.checkpoint import load_checkpoint, save_checkpoint, sha256
 from cotap.evaluation.policy import load_policy
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
-import publish
 
 TINY = ["velocity-tracking", "--episode-seconds", "2", "--command-seconds", "1.5", "--threads", "1"]
 

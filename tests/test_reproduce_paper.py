@@ -7,10 +7,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from random_policy import save_random_policy
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 import reproduce_paper as rp
+from random_policy import save_random_policy
 
 from cotap.agents.checkpoint import sha256
 

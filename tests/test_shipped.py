@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import json
-import sys
 from dataclasses import fields
-from pathlib import Path
 from typing import Any
 
 import pytest
+from publish import EVALUATIONS
 
 from cotap.agents.checkpoint import load_checkpoint, sha256
 from cotap.configs import from_plain
 from cotap.evaluate import PROTOCOLS, evaluate
 from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.policy import load_policy, shipped_checkpoint, shipped_names
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
-from publish import EVALUATIONS
 
 SMALL = "velocity-tracking.small"
 

@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 import soak
 
 ITERATION_S, EVERY_S, PAUSE_S = 5.0, 45.0, 2.0

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import MISSING, fields
 from itertools import product
 from pathlib import Path
 from typing import Any
 
+import distillation_report  # noqa: F401 - that it can be loaded
 import pytest
 import torch
 from conftest import save_policy
+from publish import EVALUATIONS
+from reproduce_paper import ARMS
 
 from cotap.agents.checkpoint import load_checkpoint, save_checkpoint
 from cotap.compliance.interface import ArmState, LawParameters
@@ -23,11 +25,6 @@ from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.policy import load_policy
 from cotap.evaluation.scenario import MODES
 from cotap.robots.chains import arm_model
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
-import distillation_report  # noqa: F401 - that it can be loaded
-from publish import EVALUATIONS
-from reproduce_paper import ARMS
 
 EVERYWHERE: dict[str, Any] = {"seed": 0, "torque_limit_scale": 1.0, "randomize": True}
 """Options of all protocols beside `num_envs`, and their defaults."""

@@ -5,14 +5,11 @@ from __future__ import annotations
 import math
 import os
 import shutil
-import sys
 import time
 from pathlib import Path
 
-import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
 import play_page
+import pytest
 
 
 @pytest.mark.parametrize(

@@ -14,12 +14,12 @@ from cotap.motions.library import MotionError, MotionLibrary, shipped_library
 from cotap.robots import ROBOTS
 
 
-def _parser() -> argparse.ArgumentParser:
+def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m cotap.motions", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
-    importer = commands.add_parser("import", help="read motion files of any known format into one library")
+    importer = commands.add_parser("import", description="Read motion files of any known format into one library.")
     importer.add_argument("sources", nargs="+", type=Path, metavar="SOURCE", help="files, or folders to search")
-    importer.add_argument("--format", default="auto", choices=("auto", *FORMATS))
+    importer.add_argument("--format", default="auto", choices=("auto", *FORMATS), help="format of the files")
     importer.add_argument(
         "--output",
         type=Path,
@@ -31,14 +31,14 @@ def _parser() -> argparse.ArgumentParser:
     importer.add_argument("--fps", type=float, metavar="HZ", help="frame rate of the files, in place of what they say")
     importer.add_argument("--source", default="not stated", help="where the motion comes from, kept in the file")
     importer.add_argument("--licence", default="not stated", help="its terms, kept in the file")
-    shower = commands.add_parser("show", help="list a library's clips, and draw them if asked to")
+    shower = commands.add_parser("show", description="List a library's clips, and draw them if asked to.")
     shower.add_argument("file", nargs="?", type=Path, metavar="FILE", help="a library; by default the shipped one")
     shower.add_argument("--clip", action="append", default=[], help="only this clip (may be repeated)")
     shower.add_argument(
         "--output", type=Path, metavar="DIR", help="draw the clips, seconds for each, and put the pictures here"
     )
     for command in (importer, shower):
-        command.add_argument("--robot", default="h1", choices=tuple(ROBOTS))
+        command.add_argument("--robot", default="h1", choices=tuple(ROBOTS), help="whose arms they move")
     return parser
 
 
@@ -76,7 +76,7 @@ def _show(options: argparse.Namespace) -> int:
 
 def main(arguments: list[str] | None = None) -> int:
     """Parse and run. Returns the exit status: 0, or 2 for what the user can correct."""
-    options = _parser().parse_args(arguments)
+    options = make_parser().parse_args(arguments)
     try:
         return {"import": _import, "show": _show}[options.command](options)
     except (ValueError, OSError) as error:
