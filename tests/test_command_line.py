@@ -104,7 +104,7 @@ def test_a_missing_package_is_named_with_its_cure(monkeypatch: pytest.MonkeyPatc
     monkeypatch.delitem(sys.modules, "cotap.compare", raising=False)
     monkeypatch.setitem(sys.modules, "tyro", None)
     assert main(["compare", "a.json", "b.json"]) == 2
-    assert "cotap compare needs tyro: pip install 'cotap[all]'" in capsys.readouterr().err
+    assert "cotap compare needs tyro: pip install 'cotap[train]'" in capsys.readouterr().err
 
 
 def test_a_line_of_help_is_cut_before_its_default():

@@ -8,6 +8,8 @@ import sys
 from cotap.command_help import Command, load_commands, show, unknown
 
 _HELP = ("-h", "--help", "--help-all")
+_EXTRAS = {"play": "play", "export": "deploy", "deploy": "deploy"}
+"""What a command needs beside the base installation, where it is not `train`."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -62,7 +64,8 @@ def _run(args: list[str]) -> int:
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] == "cotap":
             raise
-        print(f"error: cotap {args[0]} needs {error.name}: pip install 'cotap[all]'", file=sys.stderr)
+        extra = _EXTRAS.get(args[0], "train")
+        print(f"error: cotap {args[0]} needs {error.name}: pip install 'cotap[{extra}]'", file=sys.stderr)
         return 2
     return module.main(args[1:])
 
