@@ -10,7 +10,7 @@ import torch
 from cotap.compliance.dynamics import gravity_torque, joint_inertia
 from cotap.compliance.interface import Arms, ArmState, LawParameters
 from cotap.compliance.laws import LAWS, CoTaPLaw, LawConfig, PDLaw
-from cotap.compliance.stiffness import resolve_joint_stiffness
+from cotap.compliance.stiffness import condition_number, resolve_joint_stiffness
 from cotap.robots.chains import arm_model
 
 
@@ -122,11 +122,35 @@ def test_critical_damping_does_not_hold_back_a_moving_reference(arms, rng):
     torch.testing.assert_close(paper[0].at(q, dq), paper[1].at(q, dq))
 
 
-def test_gains_that_differ_are_refused(arms):
-    kp = arms.kp.clone()
-    kp[0, 0] = 50.0
-    with pytest.raises(ValueError, match="cotap needs one position gain on all joints of an arm"):
-        CoTaPLaw(replace(arms, kp=kp), LawConfig())
+def with_soft_wrists(arms: Arms) -> Arms:
+    """The same arms with gains that differ within each."""
+    return replace(arms, kp=arms.kp * torch.tensor([1.0, 0.7, 0.4, 0.1]))
+
+
+def test_gains_that_differ_give_pd_at_alpha_0_and_what_was_asked_for_at_alpha_1(arms, rng):
+    arms, state = with_soft_wrists(arms), a_state(arms, rng)
+    pd, _ = CoTaPLaw(arms, LawConfig(damping="pd"))(state, parameters(alpha=0.0))
+    torch.testing.assert_close(pd.stiffness, torch.diag_embed(arms.kp).expand(6, 2, 4, 4), rtol=1e-5, atol=1e-3)
+    law, _ = CoTaPLaw(arms, LawConfig(condition_threshold=1e6))(state, parameters(alpha=1.0))
+    jacobian = (state.to_heading.unsqueeze(1) @ arms.chains.jacobian(state.pose)).double()
+    felt = jacobian @ torch.linalg.inv(law.stiffness.double()) @ jacobian.transpose(-1, -2)
+    near = condition_number(jacobian) < 20.0
+    assert int(near.sum()) > 3
+    asked = torch.diag_embed(1.0 / parameters().stiffness).double()
+    torch.testing.assert_close(felt[near], asked[near], rtol=1e-3, atol=1e-5)
+
+
+def test_a_task_error_of_arms_with_different_gains_is_the_hands(arms, rng):
+    """A target near by: the joints' error that the law acts on takes the hand all the way."""
+    arms, state = with_soft_wrists(arms), a_state(arms, rng)
+    state = replace(state, target=state.position + 1e-3 * torch.randn(6, 2, 4, generator=rng))
+    law, _ = CoTaPLaw(arms, LawConfig(error="task", condition_threshold=1e6))(state, parameters(alpha=1.0))
+    error = torch.linalg.solve(law.stiffness.double(), law.elastic.double())
+    jacobian = arms.chains.jacobian(state.pose).double()
+    reach = (arms.chains.pose(state.target).tip - state.pose.tip).double()
+    near = condition_number(jacobian) < 20.0
+    moved = (jacobian @ error.unsqueeze(-1)).squeeze(-1)
+    torch.testing.assert_close(moved[near], reach[near], rtol=1e-2, atol=1e-6)
 
 
 @pytest.mark.parametrize(

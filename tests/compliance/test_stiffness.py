@@ -150,6 +150,65 @@ def test_the_fast_blend_is_the_slow_one(spec, rng):
     torch.testing.assert_close(known[close], resolved[close], rtol=1e-5, atol=1e-3)
 
 
+def test_null_stiffness_may_differ_between_joints():
+    """One row, two joints, by hand: `J' = J / sqrt(k)` is (1/sqrt 20, 1/sqrt 5), which has length 1/2."""
+    j, task = torch.tensor([[1.0, 1.0]], dtype=DOUBLE), torch.tensor([300.0], dtype=DOUBLE)
+    stiffness = resolve_joint_stiffness(j, task, torch.tensor([20.0, 5.0], dtype=DOUBLE))
+    torch.testing.assert_close(stiffness, torch.tensor([[316.0, 296.0], [296.0, 301.0]], dtype=DOUBLE))
+    apart = resolve_joint_stiffness(torch.tensor([[1.0, 0.0]], dtype=DOUBLE), task, torch.tensor([20.0, 5.0]).double())
+    torch.testing.assert_close(apart, torch.diag(torch.tensor([300.0, 5.0], dtype=DOUBLE)))
+
+
+def test_the_hand_is_as_stiff_as_asked_whatever_the_null_stiffness(rng):
+    j = torch.randn(200, 3, 7, dtype=DOUBLE, generator=rng)
+    null = torch.exp(torch.randn(200, 7, dtype=DOUBLE, generator=rng)) * 20.0
+    task = torch.exp(torch.randn(200, 3, dtype=DOUBLE, generator=rng)) * 300.0
+    stiffness = resolve_joint_stiffness(j, task, null)
+    felt = j @ torch.linalg.inv(stiffness) @ j.transpose(-1, -2)
+    torch.testing.assert_close(felt, torch.diag_embed(1.0 / task), rtol=1e-8, atol=1e-10)
+    assert (torch.linalg.eigvalsh(stiffness) > 0.0).all()
+    same = torch.full((200, 7), 25.0, dtype=DOUBLE)
+    torch.testing.assert_close(resolve_joint_stiffness(j, task, same), resolve_joint_stiffness(j, task, 25.0))
+    with pytest.raises(ValueError, match="null_stiffness must be positive, got -1"):
+        resolve_joint_stiffness(j, task, torch.where(null == null[0, 0], -1.0, null))
+    with pytest.raises(ValueError, match=r"null_stiffness must be one number or, as jacobian, have shape \(200,\)"):
+        resolve_joint_stiffness(j, task, null[:, :6])
+
+
+@pytest.mark.parametrize("joints", [4, 7])
+def test_the_fast_blend_of_different_gains_is_the_geodesic_from_pd(joints: int, rng):
+    j = torch.randn(300, 2, 3, joints, generator=rng)
+    task = torch.exp(torch.empty(300, 2, 3).uniform_(math.log(80.0), math.log(1200.0), generator=rng))
+    gains = torch.tensor([100.0, 60.0, 40.0, 20.0, 20.0, 10.0, 4.0])[:joints].expand(300, 2, joints)
+    null, alpha = torch.empty(300, 2).uniform_(15.0, 60.0, generator=rng), torch.rand(300, 2, generator=rng)
+    fast = blended_stiffness(j, task, null, gains, alpha, 10.0)
+    each = (null.unsqueeze(-1) * gains / 100.0).double()
+    goal = resolve_joint_stiffness(j.double(), task.double(), each)
+    ratio = singularity_aware_ratio(alpha.double(), j.double())
+    root = gains.double().sqrt()
+    between = goal / root.unsqueeze(-1) / root.unsqueeze(-2)
+    values, vectors = torch.linalg.eigh(between)
+    power = (vectors * values.pow(ratio.unsqueeze(-1)).unsqueeze(-2)) @ vectors.transpose(-1, -2)
+    slow = root.unsqueeze(-1) * power * root.unsqueeze(-2)
+    near = condition_number(j.double()) < 30.0
+    torch.testing.assert_close(fast.stiffness.double()[near], slow[near], rtol=1e-4, atol=1e-3)
+    torch.testing.assert_close(fast.ratio.double(), ratio, rtol=1e-5, atol=1e-6)
+    relative = 100.0 * torch.linalg.eigvalsh(power)[..., [0, -1]]
+    torch.testing.assert_close(fast.eigenvalue_range.double()[near], relative[near], rtol=1e-4, atol=1e-3)
+    inverse, projector = fast.pseudo_inverse.double()[near], fast.null_projector.double()[near]
+    eye, known = torch.eye(3, dtype=DOUBLE), j.double()[near]
+    torch.testing.assert_close(known @ inverse, eye.expand(len(known), 3, 3), rtol=0, atol=1e-4)
+    eye = torch.eye(joints, dtype=DOUBLE).expand_as(projector)
+    torch.testing.assert_close(inverse @ known + projector, eye, rtol=0, atol=1e-4)
+    # The log-Euclidean blend has the same ends and is near in between.
+    literal = modulate_stiffness(goal, torch.diag_embed(gains.double()), ratio)
+    apart = (literal - slow).norm(dim=(-1, -2)) / slow.norm(dim=(-1, -2))
+    assert 1e-4 < float(apart.median()) < 0.3
+    alike = blended_stiffness(j, task, null, torch.full_like(gains, 50.0), alpha)
+    known = blended_stiffness(j, task, null, torch.full_like(null, 50.0), alpha)
+    torch.testing.assert_close(alike.stiffness, known.stiffness, rtol=1e-5, atol=1e-4)
+
+
 def test_closed_forms_of_three_by_three(rng):
     a = torch.randn(500, 3, 3, dtype=DOUBLE, generator=rng)
     a = a @ a.transpose(-1, -2)

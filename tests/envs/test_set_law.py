@@ -6,13 +6,8 @@ import pytest
 import torch
 from env_tools import NOMINAL, drive, mujoco_of, zeros
 
-from cotap.compliance.laws import LawConfig
+from cotap.compliance.laws import LAWS, LawConfig
 from cotap.envs.randomization import RandomizationConfig
-
-
-def compliant(robot: str, **fields) -> LawConfig:
-    """cotap asks for one gain on all joints of an arm."""
-    return LawConfig("cotap" if robot == "h1" else "hmc", **fields)
 
 
 def test_a_law_set_in_one_env_and_arm_moves_only_that(make_env, robot):
@@ -20,7 +15,7 @@ def test_a_law_set_in_one_env_and_arm_moves_only_that(make_env, robot):
     for e in (env, twin):
         e.motions.hold(e.motions.default)
         e.reset()
-    env.set_law(1, 0, compliant(robot, stiffness=(200.0, 300.0, 400.0), alpha=0.5))
+    env.set_law(1, 0, LawConfig("cotap", stiffness=(200.0, 300.0, 400.0), alpha=0.5))
     for _ in range(10):
         for e in (env, twin):
             e.step(zeros(e))
@@ -87,11 +82,15 @@ def test_a_law_out_of_range_changes_nothing(make_env, robot):
     assert not env.upper_body.active
 
 
-def test_a_law_that_the_arms_cannot_have_changes_nothing(make_env):
-    env = make_env(2, robot="made-up")
+def test_a_law_that_the_arms_cannot_have_changes_nothing(make_env, monkeypatch: pytest.MonkeyPatch):
+    def refuse(arms, _):
+        raise ValueError(f"needs three arms, got {len(arms.kp)}")
+
+    monkeypatch.setitem(LAWS, "three-armed", refuse)
+    env = make_env(2)
     before = env.upper_body.parameters.stiffness.clone()
-    with pytest.raises(ValueError, match="one position gain"):
-        env.set_law(0, 0, LawConfig("cotap", stiffness=(111.0, 111.0, 111.0)))
+    with pytest.raises(ValueError, match="needs three arms, got 2"):
+        env.set_law(0, 0, LawConfig("three-armed", stiffness=(111.0, 111.0, 111.0)))
     assert torch.equal(env.upper_body.parameters.stiffness, before)
     assert not env.upper_body.active
     drive(env, 2)

@@ -21,11 +21,6 @@ def both(law: LawConfig, **fields) -> UpperBodyConfig:
     return UpperBodyConfig(law, copy.copy(law), **fields)
 
 
-def compliant(robot: str, **fields) -> UpperBodyConfig:
-    """A law of full matrices that the robot's arms can have: cotap asks for one gain on all joints of an arm."""
-    return both(LawConfig("cotap" if robot == "h1" else "hmc"), **fields)
-
-
 def loaded(profile: ForceProfile) -> ExternalForceConfig:
     return ExternalForceConfig(scripted=profile)
 
@@ -38,7 +33,7 @@ def of_arms(env, values: torch.Tensor) -> torch.Tensor:
 def test_actuators_give_the_laws_torque(make_env, robot, randomized):
     """The control that is about to be applied, against the torque that the law says, limits included."""
     env = make_env(
-        3, robot=robot, upper_body=compliant(robot), randomization=RandomizationConfig(enabled=randomized),
+        3, robot=robot, upper_body=both(LawConfig("cotap")), randomization=RandomizationConfig(enabled=randomized),
         torque_limit_scale=0.3,
     )  # fmt: skip
     drive(env, 4)
@@ -59,7 +54,7 @@ def test_actuators_give_the_laws_torque(make_env, robot, randomized):
 
 
 def test_what_is_observed_is_what_the_law_asks(make_env, robot):
-    env = make_env(3, robot=robot, upper_body=compliant(robot))
+    env = make_env(3, robot=robot, upper_body=both(LawConfig("cotap")))
     drive(env, 5)
     q, dq = of_arms(env, env.state.joint_pos), of_arms(env, env.state.joint_vel)
     scales = of_arms(env, env.randomizer.kp_scale), of_arms(env, env.randomizer.kd_scale)
@@ -115,7 +110,7 @@ def test_arms_have_laws_of_their_own(make_env):
 
 
 def test_parameters_differ_between_envs_and_may_change(make_env):
-    env = make_env(2, upper_body=compliant("h1"), randomization=NOMINAL)
+    env = make_env(2, upper_body=both(LawConfig("cotap")), randomization=NOMINAL)
     env.motions.hold(env.motions.default)
     env.reset()
     env.upper_body.parameters.stiffness[1] = 900.0
@@ -158,7 +153,7 @@ def test_a_share_of_the_draws_is_all_compliance(make_env):
 
 
 def test_a_late_command_is_mixed_with_the_one_before(make_env, robot):
-    env = make_env(2, robot=robot, upper_body=compliant(robot))
+    env = make_env(2, robot=robot, upper_body=both(LawConfig("cotap")))
     drive(env, 3)
     q, dq = of_arms(env, env.state.joint_pos) + 0.05, of_arms(env, env.state.joint_vel)
     ones = torch.ones_like(q)
@@ -169,7 +164,7 @@ def test_a_late_command_is_mixed_with_the_one_before(make_env, robot):
 
 def test_gain_errors_leave_gravity_torques_alone(make_env, robot):
     """They scale the elastic torque and the damping."""
-    env = make_env(2, robot=robot, upper_body=compliant(robot), randomization=NOMINAL)
+    env = make_env(2, robot=robot, upper_body=both(LawConfig("cotap")), randomization=NOMINAL)
     drive(env, 3)
     q, dq, now = of_arms(env, env.state.joint_pos), of_arms(env, env.state.joint_vel), torch.ones(2)
     ones, law = torch.ones_like(q), env.upper_body.newest
@@ -234,7 +229,7 @@ def test_a_restarted_env_has_a_hand_that_felt_nothing(make_env, robot):
 
 def test_hands_feel_the_last_step_in_the_heading_frame(make_env, robot):
     load = loaded(ForceProfile((5.0, -10.0, 15.0), "right", start_s=0.02))
-    env = make_env(2, robot=robot, upper_body=compliant(robot), forces=load)
+    env = make_env(2, robot=robot, upper_body=both(LawConfig("cotap")), forces=load)
     felt = []
     for _ in range(3):
         env.step(zeros(env))
@@ -277,7 +272,7 @@ def test_forces_are_estimated_on_arms_of_any_length(make_env):
 
 @pytest.mark.parametrize("torso", ["none", "constant", "support"])
 def test_a_run_goes_on_exactly(make_env, robot, torso):
-    cfg = compliant(robot, torso=TorsoComplianceConfig(torso))
+    cfg = both(LawConfig("cotap"), torso=TorsoComplianceConfig(torso))
     env = make_env(3, robot=robot, upper_body=copy.deepcopy(cfg))
     env.upper_body.parameters.alpha[:] = torch.rand(3, 2, generator=torch.Generator().manual_seed(0))
     drive(env, 6)
@@ -290,7 +285,7 @@ def test_a_run_goes_on_exactly(make_env, robot, torso):
 
 
 def test_a_restarted_env_has_no_law_from_before(make_env, robot):
-    env = make_env(2, robot=robot, upper_body=compliant(robot))
+    env = make_env(2, robot=robot, upper_body=both(LawConfig("cotap")))
     drive(env, 3)
     knock_over(env, 1)
     env.step(zeros(env))
@@ -311,11 +306,6 @@ def test_an_infeasible_stiffness_is_counted_in_the_log(make_env):
     *_, extras = env.step(zeros(env))
     assert float(extras["log"]["/law/projected"]) == 1.0
     assert torch.isfinite(env.state.joint_pos).all()
-
-
-def test_cotap_refuses_arms_whose_gains_differ(make_env):
-    with pytest.raises(ValueError, match="one position gain on all joints of an arm"):
-        make_env(1, robot="made-up", upper_body=both(LawConfig("cotap")))
 
 
 @pytest.mark.parametrize(

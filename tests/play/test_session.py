@@ -7,6 +7,7 @@ import pytest
 import torch
 from random_policy import save_random_policy
 
+from cotap.compliance.laws import LAWS
 from cotap.envs.rewards import LowerRewards, RewardGroup, UpperRewards
 from cotap.play.forces import Push
 from cotap.play.sample import effective_stiffness
@@ -148,12 +149,11 @@ def test_stiffness_stays_what_was_set_under_a_policy_that_was_trained_with_all(t
     assert parameters.alpha.tolist() == [[1.0, 1.0], [1.0, 0.25]]
 
 
-def test_a_robot_with_other_arms_has_the_laws_that_fit_them(tmp_path):
+def test_a_robot_with_other_arms_has_all_laws(tmp_path):
     session = Session({"base": save_random_policy(tmp_path / "base.pt", robot="made-up")})
     law = session.controls["a.left.law"]
-    assert "pd" in law.options
-    assert "cotap" not in law.options  # it asks for one gain on all joints
-    assert session.set({"a.left.law": "hmc", "motion": "rest"}) == []
+    assert law.options == tuple(LAWS)
+    assert session.set({"a.left.law": "cotap", "motion": "rest"}) == []
     sample = run(session, 3)[-1]
     assert sample["arm_torque"].shape == (2, 14)
     assert sample["qpos"].shape == (2, 7 + len(session.env.spec.joints))

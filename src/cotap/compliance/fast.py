@@ -6,13 +6,15 @@ For a PD law whose gain is one number k on all joints of an arm, the log-Euclide
     K = k^(1-a) (B^T G^(a-1) B + k_null^a N),
 
 and the power of the m x m matrix G is a Newton polynomial through its eigenvalues, which have a closed form for m = 3.
+Gains that differ between joints become one number where joints are measured in units of `1 / sqrt(gain)`: there the
+blend is taken, and the result is on the geodesic `P^1/2 (P^-1/2 K_u P^-1/2)^a P^1/2` from the PD gains P to `K_u`.
 All in float64: the polynomial's terms cancel, and one double costs less than one eigendecomposition. Not to be
 differentiated: where eigenvalues coincide, the result is not finite.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -29,7 +31,7 @@ class ArmStiffness:
     stiffness: torch.Tensor
     """(..., n, n) the blend K [Nm/rad]."""
     pseudo_inverse: torch.Tensor
-    """(..., n, 3) J#, damped near rank loss."""
+    """(..., n, 3) J#, damped near rank loss; of all that reach the hand's target, what the PD gains resist least."""
     null_projector: torch.Tensor
     """(..., n, n) I - J# J."""
     ratio: torch.Tensor
@@ -37,7 +39,8 @@ class ArmStiffness:
     singularity: torch.Tensor
     """(...) 1 / (1 + max(0, cond(J) - threshold))."""
     eigenvalue_range: torch.Tensor
-    """(..., 2) smallest and largest eigenvalue of K [Nm/rad]."""
+    """(..., 2) smallest and largest eigenvalue of K [Nm/rad]; where gains differ, of K relative to them, times the
+    largest gain."""
 
 
 def eigenvalues_3x3(a: torch.Tensor) -> torch.Tensor:
@@ -89,30 +92,57 @@ def blended_stiffness(
     """The singularity-aware blend of compliance and PD (paper, equations 7 to 10).
 
     Agrees with `modulate_stiffness(resolve_joint_stiffness(...), pd, singularity_aware_ratio(...))` up to the damping
-    near rank loss. Arguments are taken to be valid.
+    near rank loss, for gains that differ at alpha 0 and 1. Arguments are taken to be valid.
 
     Args:
         jacobian: (..., 3, n) of the hands, in the frame in which stiffness is diagonal [m/rad].
         task_stiffness: (..., 3) what the arm contributes, `C_hat^-1` as a diagonal, or (..., 3, 3) [N/m].
-        null_stiffness: (...) [Nm/rad].
-        pd_stiffness: (...) the PD law's gain, the same on all joints of an arm [Nm/rad].
+        null_stiffness: (...) of the joint with the largest gain; that of the others is as many times lower as their
+            gains are [Nm/rad].
+        pd_stiffness: The PD law's gains: (...) where they are the same on all joints of an arm, else (..., n) [Nm/rad].
         alpha: (...) in [0, 1].
         threshold: Condition number up to which alpha is kept.
     """
     j = jacobian.double()
-    gram = j @ j.transpose(-1, -2)
-    squares = eigenvalues_3x3(gram)
-    largest = squares[..., 2].clamp_min(1e-12)
-    condition = (largest / squares[..., 0].clamp_min(1e-14 * largest)).sqrt()
-    singularity = 1.0 / (1.0 + (condition - threshold).clamp_min(0.0))
+    squares = eigenvalues_3x3(j @ j.transpose(-1, -2))
+    singularity = 1.0 / (1.0 + (_condition(squares) - threshold).clamp_min(0.0))
     ratio = alpha.double() * singularity
+    if pd_stiffness.dim() < jacobian.dim() - 1:
+        return _in_one_gain(
+            j, squares, task_stiffness, null_stiffness, pd_stiffness, ratio, singularity, jacobian.dtype
+        )
+    largest = pd_stiffness.double().amax(-1)
+    root = (pd_stiffness.double() / largest.unsqueeze(-1)).sqrt()
+    j = j / root.unsqueeze(-2)
+    squares = eigenvalues_3x3(j @ j.transpose(-1, -2))
+    blend = _in_one_gain(j, squares, task_stiffness, null_stiffness, largest, ratio, singularity, jacobian.dtype)
+    rows, columns = root.to(jacobian.dtype).unsqueeze(-1), root.to(jacobian.dtype).unsqueeze(-2)
+    return replace(
+        blend, stiffness=rows * blend.stiffness * columns, pseudo_inverse=blend.pseudo_inverse / rows,
+        null_projector=blend.null_projector / rows * columns,
+    )  # fmt: skip
+
+
+def _condition(squares: torch.Tensor) -> torch.Tensor:
+    """Condition number (...) of a Jacobian, of its squared singular values (..., 3)."""
+    largest = squares[..., 2].clamp_min(1e-12)
+    return (largest / squares[..., 0].clamp_min(1e-14 * largest)).sqrt()
+
+
+def _in_one_gain(
+    j: torch.Tensor, squares: torch.Tensor, task_stiffness: torch.Tensor, null_stiffness: torch.Tensor,
+    pd_stiffness: torch.Tensor, ratio: torch.Tensor, singularity: torch.Tensor, kind: torch.dtype,
+) -> ArmStiffness:  # fmt: skip
+    """`blended_stiffness` for one gain (...), of a Jacobian in float64 and its squared singular values."""
+    gram = j @ j.transpose(-1, -2)
+    largest = squares[..., 2].clamp_min(1e-12)
     missing = (RANK_TOLERANCE**2 * largest - squares[..., 0]).clamp_min(0.0)
     eye = torch.eye(j.shape[-1], dtype=j.dtype, device=j.device)
     transposed = j.transpose(-1, -2)
     pseudo_inverse = transposed @ inverse_3x3(_plus(gram, missing))
     # The projector itself is as exact as doubles allow: the rank that is lost is made up for in the power below.
     null_projector = eye - transposed @ inverse_3x3(_plus(gram, _ROUNDING * largest)) @ j
-    if task_stiffness.dim() == jacobian.dim():
+    if task_stiffness.dim() == j.dim():
         b = torch.linalg.cholesky(task_stiffness.double()).transpose(-1, -2) @ j
     else:
         b = task_stiffness.double().sqrt().unsqueeze(-1) * j
@@ -130,7 +160,6 @@ def blended_stiffness(
     stiffness = scale[..., None, None] * (task + of_null[..., None, None] * null_projector)
     ends = stiff[..., [0, 2]].pow(ratio.unsqueeze(-1))
     spectrum = torch.stack((torch.minimum(ends[..., 0], of_null), torch.maximum(ends[..., 1], of_null)), -1)
-    kind = jacobian.dtype
     return ArmStiffness(
         stiffness.to(kind), pseudo_inverse.to(kind), null_projector.to(kind), ratio.to(kind), singularity.to(kind),
         (scale.unsqueeze(-1) * spectrum).to(kind),

@@ -30,7 +30,8 @@ class LawConfig:
     stiffness: tuple[float, float, float] = (300.0, 300.0, 300.0)
     """Hand stiffness K_ee along x, y and z of the heading frame [N/m] (all but pd and soft-pd)."""
     null_stiffness: float = 40.0
-    """Stiffness k_null of arm motion that leaves the hand where it is [Nm/rad] (cotap)."""
+    """Stiffness k_null of arm motion that leaves the hand where it is [Nm/rad] (cotap): of the joint with the largest
+    PD gain; that of the others is as many times lower as their gains are."""
     alpha: float = 1.0
     """Share of compliance in its blend with PD: 1 all compliance, 0 all PD. Of stiffness and with gravity compensation
     under cotap, of torques under hmc."""
@@ -98,17 +99,14 @@ class CoTaPLaw:
     """Task-space compliance blended with PD on the manifold of stiffness matrices (paper, section III).
 
     Args:
-        arms: What is driven; the PD law must have one gain on all joints of an arm.
+        arms: What is driven.
         cfg: Which error and which damping.
-
-    Raises:
-        ValueError: the PD gains of an arm differ between its joints.
     """
 
     def __init__(self, arms: Arms, cfg: LawConfig) -> None:
-        if not torch.equal(arms.kp, arms.kp[:, :1].expand_as(arms.kp)):
-            raise ValueError(f"cotap needs one position gain on all joints of an arm, got {arms.kp.tolist()}")
         self._arms, self._cfg = arms, cfg
+        alike = torch.equal(arms.kp, arms.kp[:, :1].expand_as(arms.kp))
+        self._gains = arms.kp[:, 0] if alike else arms.kp  # (A,), which costs less, or (A, n)
         self._damping = torch.diag_embed(arms.kd)
 
     @full_precision
@@ -117,7 +115,7 @@ class CoTaPLaw:
         n = state.position.shape[0]
         jacobian_h = state.to_heading.unsqueeze(1) @ self._arms.chains.jacobian(state.pose)
         felt, projected = _arm_stiffness(parameters.stiffness, state.base_compliance_h)
-        pd = self._arms.kp[:, 0].expand(n, -1)
+        pd = self._gains.expand(n, *self._gains.shape)
         blend = blended_stiffness(
             jacobian_h, felt, parameters.null_stiffness, pd, parameters.alpha, self._cfg.condition_threshold
         )

@@ -168,15 +168,20 @@ def resolve_joint_stiffness(
 
     With null-space stiffness a multiple of the identity this equals the paper's general form,
     `K_u^-1 = J# C_hat J#^T + Y - J# J Y J^T J#^T` with `Y = I / k_null` (paper, equation 7), without inverting an
-    n x n matrix. It is symmetric positive definite at every pose, singular ones included: near those the projector is
-    damped (see `RANK_TOLERANCE`), which adds stiffness and never takes it away. It is differentiable to any order
-    except where damping sets in.
+    n x n matrix. With one that differs between joints it is `J^T C_hat^-1 J + S (I - J'# J') S`, S the diagonal of
+    `sqrt(k_null)` and `J' = J S^-1`: positive definite, where the paper's form need not be, and the hand feels just as
+    stiff, `J K_u^-1 J^T = C_hat`.
+
+    It is symmetric positive definite at every pose, singular ones included: near those the projector is damped (see
+    `RANK_TOLERANCE`), which adds stiffness and never takes it away. It is differentiable to any order except where
+    damping sets in.
 
     Args:
         jacobian: (..., m, n), m <= n: 3-D positions of any arm, 6-D poses of arms with at least 6 joints, or both
             hands stacked.
         task_stiffness: (..., m) diagonal or (..., m, m), symmetric positive definite [N/m].
-        null_stiffness: (...) or one number, positive: stiffness of motion that leaves the hand where it is [Nm/rad].
+        null_stiffness: (...) or one number, or (..., n) joint by joint, positive: stiffness of motion that leaves the
+            hand where it is [Nm/rad].
         base_compliance: (..., m) or (..., m, m): the hand's compliance through a moving base [m/N]; None for none.
         characteristic_length: Factor on rows 4 to 6 where damping is decided, if m is 6: see `condition_number`.
 
@@ -187,16 +192,27 @@ def resolve_joint_stiffness(
             `spd_log`), the base does not allow the stiffness asked for, or the length is not positive.
     """
     require_jacobian(jacobian)
-    null = one_per_matrix("null_stiffness", null_stiffness, "jacobian", jacobian)
+    null = _null_stiffness(null_stiffness, jacobian)
     if values_are_known() and not (null.detach() > 0.0).all():
         raise ValueError(f"null_stiffness must be positive, got {float(null.detach().amin()):g}")
     lengths = _row_lengths(jacobian, characteristic_length)
     stiffness = torch.linalg.inv(task_compliance(jacobian, task_stiffness, base_compliance, lengths))
     j = lengths.unsqueeze(-1) * jacobian.double()
-    transposed = j.transpose(-1, -2)
+    root = null.sqrt()
+    scaled = j / root.unsqueeze(-2)
     eye = torch.eye(j.shape[-1], dtype=j.dtype, device=j.device)
-    projector = eye - transposed @ damped_gram_inverse(j) @ j
-    return symmetric_part(transposed @ stiffness @ j + null[..., None, None] * projector).to(jacobian.dtype)
+    projector = eye - scaled.transpose(-1, -2) @ damped_gram_inverse(scaled) @ scaled
+    of_null = root.unsqueeze(-1) * projector * root.unsqueeze(-2)
+    return symmetric_part(j.transpose(-1, -2) @ stiffness @ j + of_null).to(jacobian.dtype)
+
+
+def _null_stiffness(value: torch.Tensor | float, jacobian: torch.Tensor) -> torch.Tensor:
+    """`value`, (...) or one number or (..., n), as (..., n) in float64. Raises ValueError if it has another shape."""
+    if isinstance(value, torch.Tensor) and value.shape == jacobian[..., 0, :].shape:
+        require_like("null_stiffness", value, "jacobian", jacobian)
+        return value.double()
+    null = one_per_matrix("null_stiffness", value, "jacobian", jacobian)
+    return null.unsqueeze(-1).expand(*null.shape, jacobian.shape[-1])
 
 
 def require_jacobian(jacobian: torch.Tensor) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +11,6 @@ import torch
 
 from cotap.agents.actors import as_dict
 from cotap.agents.checkpoint import require_layout, sha256
-from cotap.compliance.interface import Arms
 from cotap.compliance.laws import LAWS, LawConfig, reads
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.scripted_forces import ForceProfile
@@ -67,7 +65,7 @@ class Session:
         self.controls: dict[str, Control] = make_controls(
             Ranges(
                 c.velocity_x, c.velocity_y, c.yaw_rate, c.height_offset,
-                self.sides, usable_laws(env.upper_body.arms), (REST, *clips), tuple(self._checkpoints),
+                self.sides, tuple(LAWS), (REST, *clips), tuple(self._checkpoints),
             )
         )  # fmt: skip
         self.values: dict[str, Any] = {name: control.default for name, control in self.controls.items()}
@@ -232,16 +230,6 @@ class Session:
         env = self.env
         env.sim.qpos[mask, 3:7] = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
         env.state = env.reader.read()
-
-
-def usable_laws(arms: Arms) -> tuple[str, ...]:
-    """The laws that these arms can be under: some ask for arms of a kind."""
-    names = []
-    for name, law in LAWS.items():
-        with contextlib.suppress(ValueError):
-            law(arms, LawConfig(name))
-            names.append(name)
-    return tuple(names)
 
 
 def play_config(env_cfg: HumanoidEnvConfig, library: str = "") -> HumanoidEnvConfig:

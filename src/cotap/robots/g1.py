@@ -9,7 +9,8 @@ from cotap.robots.shapes import COLORS, capsule
 from cotap.robots.spec import ArmSpec, FootSpec, GeomSpec, RobotSpec
 
 # Legs: Unitree's of unitree_rl_gym. Waist: FALCON's, where the lower agent moves it too. Arms: Unitree's of the
-# examples of unitree_sdk2. The default pose of the legs has the centre of mass over the middle of the soles.
+# examples of unitree_sdk2, halved at the wrists, which hold 5 Nm. The default pose of the legs has the centre of mass
+# over the middle of the soles.
 _GAINS = {
     "hip": Gains(100.0, 2.0),
     "hip_pitch": Gains(100.0, 2.0, -0.13),
@@ -19,7 +20,7 @@ _GAINS = {
     "waist": Gains(300.0, 5.0),
     "shoulder": Gains(40.0, 1.0),
     "elbow": Gains(40.0, 1.0),
-    "wrist": Gains(40.0, 1.0),
+    "wrist": Gains(20.0, 0.5),
 }
 _ARM = ("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow", "wrist_roll", "wrist_pitch", "wrist_yaw")
 
