@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from itertools import permutations
 
 import numpy as np
@@ -107,10 +108,17 @@ def test_derivatives_of_any_order_by_hand():
         derivative = gradient
     one = torch.ones(1, 1)
     assert float(torch.autograd.functional.jvp(spd_log, k.detach(), one)[1]) == pytest.approx(0.25)
-    assert float(torch.func.jvp(spd_log, (k.detach(),), (one,))[1]) == pytest.approx(0.25)
+    forward = spd_log
+    for expected in (1 / 4, -1 / 16, 2 / 64, -6 / 256):  # forward over forward
+        forward = _along_one(forward)
+        assert float(forward(k.detach())) == pytest.approx(expected, rel=1e-6)
     (slope,) = torch.autograd.grad(spd_log(k).sum(), k, create_graph=True)
     (gradient,) = torch.autograd.grad((k + slope.square()).sum(), k)
     assert float(gradient) == pytest.approx(1.0 - 2.0 / 64.0)
+
+
+def _along_one(function: Callable[[torch.Tensor], torch.Tensor]) -> Callable[[torch.Tensor], torch.Tensor]:
+    return lambda k: torch.func.jvp(function, (k,), (torch.ones(1, 1),))[1]
 
 
 def few_eigenvalues(rng, *values: float) -> torch.Tensor:
@@ -132,7 +140,14 @@ def test_second_derivatives_at_distinct_close_and_equal_eigenvalues(rng, values)
     def log_det(m: torch.Tensor) -> torch.Tensor:
         return spd_log(m).trace()
 
-    for hessian in (torch.autograd.functional.hessian(log_det, k), torch.func.hessian(log_det)(k)):
+    of = torch.autograd.functional.hessian
+    hessians = [
+        of(log_det, k), of(log_det, k, vectorize=True),
+        of(log_det, k, vectorize=True, outer_jacobian_strategy="forward-mode"),
+    ]  # fmt: skip
+    modes = (torch.func.jacrev, torch.func.jacfwd)
+    hessians += [outer(inner(log_det))(k) for outer in modes for inner in modes]
+    for hessian in hessians:
         torch.testing.assert_close(hessian, closed, rtol=1e-9, atol=1e-10)
     k = k.requires_grad_()
     other = few_eigenvalues(rng, 1.0, 1.0, 3.0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import subprocess
 import sys
+from collections.abc import Callable
 from itertools import permutations
 
 import pytest
@@ -246,6 +247,32 @@ def test_the_derivative_of_the_damped_projector_by_hand():
     (gradient,) = torch.autograd.grad(k11, j)
     expected = torch.tensor([[20.0, 0.0], [0.0, 600.0 * 0.01 - 80.0 * 0.01 / 0.02**2]], dtype=DOUBLE)
     torch.testing.assert_close(gradient, expected)
+
+
+def test_forward_derivatives_of_any_order_by_hand():
+    """Forward over forward: of 20 / x, 0.7 / (x - 1), 300 x^2 + 40 (1 - x^2 / 0.02^2) where damped, and x^0.5."""
+    one, task = torch.tensor(1.0, dtype=DOUBLE), torch.full((2,), 300.0, dtype=DOUBLE)
+
+    def diagonal(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+        return torch.diag(torch.stack((a, b)))
+
+    for function, at, derivatives in (
+        (lambda x: condition_number(diagonal(20.0 * one, x)), 4.0, (5.0, -1.25, 0.625, -0.46875)),
+        (lambda x: singularity_aware_ratio(0.7, diagonal(x, one), 2.0), 4.0, (0.7 / 3, -0.7 / 9, 1.4 / 27, -4.2 / 81)),
+        (lambda x: resolve_joint_stiffness(diagonal(one, x), task, 40.0)[1, 1], 0.01, (30.03, -1994.0, -199400.0, 0.0)),
+        (
+            lambda x: modulate_stiffness(x.expand(1, 1), torch.ones_like(x).expand(1, 1), 0.5),
+            4.0,
+            (2, 1 / 4, -1 / 32, 3 / 256),
+        ),
+    ):
+        for expected in derivatives:
+            assert float(function(torch.tensor(at, dtype=DOUBLE))) == pytest.approx(expected, rel=1e-9, abs=1e-6)
+            function = _slope(function)
+
+
+def _slope(function: Callable[[torch.Tensor], torch.Tensor]) -> Callable[[torch.Tensor], torch.Tensor]:
+    return lambda x: torch.func.jvp(function, (x,), (torch.ones_like(x),))[1]
 
 
 def test_gradients_at_straight_and_nearly_straight_arms(spec, rng):

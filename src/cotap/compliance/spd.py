@@ -12,6 +12,7 @@ import math
 from typing import Any, cast
 
 import torch
+from torch.autograd.forward_ad import _set_fwd_grad_enabled
 
 from cotap.compliance.arguments import (
     one_per_matrix,
@@ -27,8 +28,6 @@ from cotap.compliance.arguments import (
 
 class _SpdLog(torch.autograd.Function):
     """Logarithm of a matrix with known eigenvectors. Equal eigenvalues (a PD law's) do not upset its derivatives."""
-
-    generate_vmap_rule = True
 
     @staticmethod
     def forward(matrix: torch.Tensor, values: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:  # noqa: ARG004  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -47,9 +46,19 @@ class _SpdLog(torch.autograd.Function):
         return _last_log_derivative(values, vectors, symmetric_part(gradient)), None, None
 
     @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *inputs: torch.Tensor) -> tuple[torch.Tensor, int]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        # By hand: the rule that torch makes up fails in backward over a vectorised forward.
+        batch = info.batch_size
+        whole = (
+            x.expand(batch, *x.shape) if d is None else x.movedim(d, 0) for x, d in zip(inputs, in_dims, strict=True)
+        )
+        return cast(torch.Tensor, _SpdLog.apply(*whole)), 0
+
+    @staticmethod
     def jvp(ctx: Any, tangent: torch.Tensor, *_: None) -> torch.Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
         (log,) = ctx.saved_tensors
-        return _log_derivative(log, tangent)
+        with _set_fwd_grad_enabled(True):  # torch disables it in here: forward over forward would be zero
+            return _log_derivative(log, tangent)
 
 
 def _log_derivative(log: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:
@@ -61,9 +70,10 @@ def _log_derivative(log: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:
     base = log.unsqueeze(-3).expand(*log.shape[:-2], n * n, n, n)
     each = torch.eye(n * n, dtype=log.dtype, device=log.device).unflatten(-1, (n, n)).expand_as(base)
     blocks = torch.cat((torch.cat((base, each), -1), torch.cat((torch.zeros_like(base), base), -1)), -2)
-    derivatives = torch.linalg.matrix_exp(blocks)[..., :n, n:].flatten(-2)
-    solved = torch.linalg.solve(derivatives.transpose(-1, -2), direction.flatten(-2).unsqueeze(-1))
-    return solved.squeeze(-1).unflatten(-1, (n, n))
+    derivatives = torch.linalg.matrix_exp(blocks)[..., :n, n:].reshape(*base.shape[:-2], n * n)
+    # Not `solve`: in torch, forward derivatives of its forward derivatives are wrong.
+    inverse = torch.linalg.inv(derivatives.transpose(-1, -2))
+    return (inverse @ direction.reshape(*direction.shape[:-2], n * n, 1)).reshape(direction.shape)
 
 
 def _last_log_derivative(values: torch.Tensor, vectors: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:
