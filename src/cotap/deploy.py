@@ -88,6 +88,8 @@ def deploy(options: DeployOptions) -> dict[str, Any]:
         raise ValueError("--keyboard goes with neither --scenario nor --trials")
     if options.scenario and (options.episode_seconds is not None or options.arm_motion or options.library):
         raise ValueError("--episode-seconds, --arm-motion and --library do nothing with --scenario: it says so itself")
+    if options.library and not options.arm_motion:
+        raise ValueError(f"--library {options.library!r} does nothing without --arm-motion, which names a clip")
     if options.video:
         require_renderer()
     policy = OnnxPolicy(options.policy)

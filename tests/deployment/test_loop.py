@@ -27,6 +27,7 @@ from cotap.envs.commands import CommandConfig
 from cotap.envs.scripted_forces import ForceProfile
 from cotap.envs.upper_body import UpperBodyConfig
 from cotap.evaluation.policy import shipped_checkpoint
+from cotap.motions import MotionLibrary, shipped_library
 
 FAST = EngineConfig(timestep=0.01, collision="feet", cone="pyramidal")
 FREE = np.zeros((2, 3))
@@ -391,6 +392,8 @@ def test_bad_scenarios_are_named(text, message, policy_file, tmp_path, capsys):
         (["--keyboard"], "needs a terminal"),
         (["--left", "cotap:alpha=2"], "alpha must lie in"),
         (["--engine", "isaac"], "engine 'isaac' is unknown"),
+        (["--library", "own.npz"], "--library 'own.npz' does nothing without --arm-motion, which names a clip"),
+        (["--arm-motion", "walk", "--library", "none.npz"], "'none.npz' does not exist"),
     ],
 )
 def test_bad_options_are_named(arguments, message, policy_file, capsys):
@@ -398,11 +401,18 @@ def test_bad_options_are_named(arguments, message, policy_file, capsys):
     assert message in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("option", [["--episode-seconds", "5"], ["--arm-motion", "random"]])
+@pytest.mark.parametrize("option", [["--episode-seconds", "5"], ["--arm-motion", "random"], ["--library", "own.npz"]])
 def test_what_a_scenario_says_itself_is_not_asked_for_beside_it(option, policy_file, tmp_path, capsys):
     (tmp_path / "s.toml").write_text("seconds = 0.1\n")
     assert deploy(["--policy", str(policy_file), "--scenario", str(tmp_path / "s.toml"), *option]) == 2
     assert "do nothing with --scenario" in capsys.readouterr().err
+
+
+def test_arms_follow_a_clip_of_ones_own(policy_file, spec, tmp_path):
+    clip = dataclasses.replace(shipped_library(spec).clips[0], name="mine")
+    MotionLibrary([clip], spec).save(tmp_path / "own.npz")
+    own = ["--arm-motion", "mine", "--library", str(tmp_path / "own.npz")]
+    assert deploy(["--policy", str(policy_file), "--episode-seconds", "0.1", *own]) == 0
 
 
 def test_a_law_of_a_scenario_reads_its_fields(policy_file, tmp_path, capsys):

@@ -56,7 +56,10 @@ def test_a_library_is_pinned_by_its_place_and_content(library: Path, monkeypatch
     assert clips.library_sha256 == hashlib.sha256(library.read_bytes()).hexdigest()
     monkeypatch.chdir("/")
     assert load_clips(clips, h1()).names() == ["mine", "run"]
-    shipped = ClipConfig()
+    relative = ClipConfig(library=f"gone/../{library.relative_to('/')}")
+    pin_library(relative)
+    assert relative.library == str(library)  # also after the folder that it was named from is gone
+    shipped = ClipConfig(library_sha256=clips.library_sha256)  # the run that is gone on from had one
     pin_library(shipped)
     assert (shipped.library, shipped.library_sha256) == ("", "")
     with pytest.raises(MotionError, match=r"'/nowhere\.npz' does not exist"):

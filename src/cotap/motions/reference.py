@@ -80,9 +80,11 @@ def plays_clips(cfg: ClipConfig, spec: RobotSpec) -> bool:
 def pin_library(cfg: ClipConfig) -> None:
     """Write down where the library lies, and its digest unless there is one: a policy is used in other folders than
     where it was trained. Raises MotionError for a library that cannot be read."""
-    if cfg.library:
-        cfg.library = str(Path(cfg.library).absolute())
-        cfg.library_sha256 = cfg.library_sha256 or library_sha256(cfg.library)
+    if not cfg.library:
+        cfg.library_sha256 = ""
+        return
+    cfg.library = str(Path(cfg.library).resolve())
+    cfg.library_sha256 = cfg.library_sha256 or library_sha256(cfg.library)
 
 
 def load_clips(cfg: ClipConfig, spec: RobotSpec) -> MotionLibrary:
