@@ -260,9 +260,11 @@ def test_what_cannot_be_shown_is_refused_before_anything_runs(free_port, tmp_pat
     assert main(["--port", str(free_port), "--checkpoint", str(tmp_path / "none.pt")]) == 2
     assert main(["--port", str(free_port), "--robot", "atlas"]) == 2
     assert main(["--port", str(free_port), "--checkpoint", "h1-base", str(tmp_path / "none-either.pt")]) == 2
+    assert main(["--port", str(free_port), "--library", str(tmp_path / "none-of-mine.npz")]) == 2
     out, err = capsys.readouterr()
-    assert "open http" not in out
+    assert "http" not in out  # no page was opened, nor announced
     assert "none-either.pt" in err
+    assert "none-of-mine.npz' does not exist" in err
     assert "none.npz" in err
     assert "none.pt" in err
     assert "robot 'atlas' is unknown" in err
@@ -274,7 +276,7 @@ def test_what_cannot_be_shown_is_refused_before_anything_runs(free_port, tmp_pat
     assert main(["--port", str(free_port), "--robot", "made-up"]) == 2  # nobody trains it
     out, err = capsys.readouterr()
     assert "no policy of robot 'made-up' is shipped" in err
-    assert "open http" not in out
+    assert "http" not in out
 
 
 def test_checkpoints_of_two_robots_are_refused(free_port, tmp_path, capsys):
@@ -287,7 +289,7 @@ def test_a_checkpoint_brings_its_robot_and_comes_before_the_shipped_policies(ser
     path = save_random_policy(tmp_path / "policy.pt", robot="made-up")
     monkeypatch.setattr("cotap.evaluation.policy.shipped_names", lambda: ["h1-base", "made-up-base", "made-up-cotap"])
     monkeypatch.setattr("cotap.evaluation.policy.shipped_checkpoint", Path)
-    app = _live(PlayOptions(checkpoint=(str(path),)), server)
+    app = _live(PlayOptions(checkpoint=(str(path),)))(server)
     assert app.session.env.spec.name == "made-up"
     assert app.session.controls["a.checkpoint"].options == (
         str(path), "shipped made-up-cotap", "shipped made-up-base",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -71,15 +72,17 @@ def _run(options: PlayOptions) -> int:
             from cotap.play.server import open_server
     except ImportError as error:
         raise ValueError(f"the page needs viser and mjviser ({error}): pip install 'cotap[play]'") from error
+    with uncollected():
+        fill = _replay(options) if options.replay else _live(options)
     token = new_token(options.host)
     server = open_server(options.host, options.port, token)
     try:
         loading = server.gui.add_markdown("Loading the simulation ...")
-        given = bool(options.replay or options.checkpoint or options.robot)
+        given = bool(options.replay or options.checkpoint or options.robot or options.library)
         if not given:  # the page answers while torch, the policy and the model are still being loaded
             print(f"open {page_url(options.host, options.port, token)}", flush=True)
         with uncollected():
-            app = _replay(options, server) if options.replay else _live(options, server)
+            app = fill(server)
         if given:  # what was given can be shown
             print(f"open {page_url(options.host, options.port, token)}", flush=True)
         loading.remove()
@@ -90,28 +93,50 @@ def _run(options: PlayOptions) -> int:
     return 0
 
 
-def _live(options: PlayOptions, server: ViserServer) -> App:
-    from cotap.play.scene import Scene
+def _live(options: PlayOptions) -> Callable[[ViserServer], App]:
+    """Read what was given: no page is opened for what cannot be shown. Returns what fills the page."""
     from cotap.robots import ROBOTS as KNOWN_ROBOTS
 
     robot = _robot_of(options.checkpoint) if options.checkpoint else options.robot or "h1"
     require_one_of("robot", robot, KNOWN_ROBOTS)
-    scene = Scene(server, KNOWN_ROBOTS[robot](), len(ROBOTS))
-    server.flush()  # browsers prepare it while the rest is loaded
+    spec = KNOWN_ROBOTS[robot]()
+    if options.robot:
+        _policies(options, robot)
+    if options.library:
+        from cotap.motions.library import MotionLibrary
 
-    import torch
+        MotionLibrary.load(options.library, spec)
 
-    import_tensordict()  # before what would import it whole
+    def fill(server: ViserServer) -> App:
+        from cotap.play.scene import Scene
+
+        scene = Scene(server, spec, len(ROBOTS))
+        server.flush()  # browsers prepare it while the rest is loaded
+
+        import torch
+
+        import_tensordict()  # before what would import it whole
+
+        from cotap.play.app import App
+        from cotap.play.session import Session
+
+        torch.set_num_threads(1)  # two robots: more would only wait for each other
+        session = Session(_policies(options, robot), options.seed, options.library)
+        return App(server, scene, session, Path(options.output))
+
+    return fill
+
+
+def _policies(options: PlayOptions, robot: str) -> dict[str, Path]:
+    """What can be chosen, by the names that are shown; the first runs at first. Raises ValueError if there is none."""
+    import_tensordict()
 
     from cotap.evaluation.policy import find_checkpoint
-    from cotap.play.app import App
-    from cotap.play.session import Session
 
-    torch.set_num_threads(1)  # two robots: more would only wait for each other
-    checkpoints = {name: find_checkpoint(name) for name in options.checkpoint} | _shipped_policies(robot)
-    if not checkpoints:
+    policies = {name: find_checkpoint(name) for name in options.checkpoint} | _shipped_policies(robot)
+    if not policies:
         raise ValueError(f"no policy of robot {robot!r} is shipped; train one, and give it with --checkpoint")
-    return App(server, scene, Session(checkpoints, options.seed, options.library), Path(options.output))
+    return policies
 
 
 def _robot_of(checkpoints: tuple[str, ...]) -> str:
@@ -136,13 +161,20 @@ def _shipped_policies(robot: str) -> dict[str, Path]:
     return {f"shipped {name}": shipped_checkpoint(name) for name in names}
 
 
-def _replay(options: PlayOptions, server: ViserServer) -> Replay:
+def _replay(options: PlayOptions) -> Callable[[ViserServer], Replay]:
+    """Read the recording. Returns what fills the page."""
     import_tensordict()
 
     from cotap.evaluation.recording import load_recording
-    from cotap.play.replay import Replay
 
-    return Replay(server, load_recording(options.replay), Path(options.replay))
+    recording = load_recording(options.replay)
+
+    def fill(server: ViserServer) -> Replay:
+        from cotap.play.replay import Replay
+
+        return Replay(server, recording, Path(options.replay))
+
+    return fill
 
 
 if __name__ == "__main__":
