@@ -300,6 +300,46 @@ def test_bf16_runs_hidden_layers_only_and_changes_outputs_little():
     torch.testing.assert_close(full.rollout.log_probs[0], half.rollout.log_probs[0], atol=1e-3, rtol=1e-4)
 
 
+def by_hand_entropy(learner: DualPPO, agent: str) -> float:
+    return float((learner.model.log_std[agent].detach() + 0.5 * math.log(2.0 * math.pi * math.e)).sum())
+
+
+@pytest.mark.parametrize(
+    ("part", "value"),
+    [("returns", math.nan), ("returns", math.inf), ("advantages", math.nan), ("advantages", math.inf),
+     ("log_probs", math.nan)],
+)  # fmt: skip
+def test_a_step_is_skipped_where_the_gradient_of_either_network_is_not_finite(part: str, value: float):
+    """The actor's by advantages, the critic's by returns. The other agent learns on, and knows nothing of it."""
+    broken, sound = make_learner(), make_learner()
+    for learner in (broken, sound):
+        collect(learner)
+    getattr(broken.rollout, part)[:, :, 0] = value
+    before, moments = parameters(broken, "lower"), copy.deepcopy(broken.optimizers["lower"].state_dict())
+    logs = []
+    for learner in (broken, sound):
+        torch.manual_seed(0)
+        logs.append(learner.update())
+    assert (logs[0]["lower/skipped"], logs[0]["upper/skipped"], logs[1]["lower/skipped"]) == (4.0, 0.0, 0.0)
+    for key, kept in parameters(broken, "lower").items():
+        assert torch.equal(kept, before[key]), key
+    assert broken.optimizers["lower"].state_dict() == moments
+    for key, learned in parameters(broken, "upper").items():
+        assert torch.equal(learned, parameters(sound, "upper")[key]), key
+    assert all(math.isfinite(v) for v in logs[0].values())
+
+
+def test_the_log_is_the_mean_over_the_steps_that_were_not_skipped():
+    """One sample of 48 breaks one mini-batch of two in each of two passes."""
+    learner = make_learner(learning_rate=1e-7)
+    collect(learner)
+    entropy = by_hand_entropy(learner, "lower")
+    learner.rollout.returns[3, 2, 0] = math.nan
+    log = learner.update()
+    assert log["lower/skipped"] == 2.0
+    assert log["lower/entropy"] == pytest.approx(entropy, rel=1e-3)
+
+
 def test_bf16_learns_finite_parameters():
     learner = make_learner(precision="bf16")
     collect(learner)

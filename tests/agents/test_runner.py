@@ -100,6 +100,19 @@ def test_resumed_run_ends_bit_for_bit_where_a_straight_one_does(tmp_path: Path, 
     assert any(not torch.equal(v, start[k]) for k, v in weights(resumed).items())
 
 
+def test_a_resumed_run_goes_on_counting_its_hours(tmp_path: Path):
+    make_runner(tmp_path, 2).learn()
+    path = checkpoint(tmp_path, 2)
+    spent = load_checkpoint(path)["wall_seconds"]
+    assert spent > 0.0
+    save_checkpoint(path, load_checkpoint(path) | {"wall_seconds": 7200.0})
+    resumed = make_runner(tmp_path, 3)
+    resumed.load(str(path))
+    assert resumed.wall_seconds == 7200.0
+    resumed.learn()
+    assert 7200.0 < load_checkpoint(checkpoint(tmp_path, 3))["wall_seconds"] < 7200.0 + 60.0
+
+
 def test_saving_does_not_disturb_a_run(tmp_path: Path):
     for interval in (1, 100):
         make_runner(tmp_path / str(interval), 4, save_interval=interval, env=robots()).learn()

@@ -157,3 +157,17 @@ def test_references_move_no_faster_than_joints_can(arms):
     moved = (torque.elastic / arms.kp + hit.position - hit.target).abs()
     assert (moved <= DT * arms.speed + 1e-6).all()
     assert float((moved / (DT * arms.speed)).max()) > 0.99
+
+
+@pytest.mark.parametrize("name", ["facet", "dcc"])
+def test_references_go_on_from_where_they_were_moved_to(arms, name):
+    """A shift that takes several steps at the joints' velocity limits gets there, not a step's way and no further."""
+    force, old = torch.tensor([0.0, 0.0, 60.0]).expand(3, 2, 3), torch.zeros(3, dtype=torch.bool)
+    law, state = LAWS[name](arms, LawConfig(name)), a_state(arms, hand_force_h=force, fresh=old)
+    offsets = [torch.zeros_like(state.position)]
+    for _ in range(8):
+        torque, _ = law(state, parameters(stiffness=300.0))
+        offsets.append(state.position + torque.elastic / arms.kp - state.target)
+    ways = torch.stack(offsets).diff(dim=0).abs()
+    assert (ways <= DT * arms.speed + 1e-5).all()
+    assert float((offsets[-1].abs() / (DT * arms.speed)).max()) > 1.3

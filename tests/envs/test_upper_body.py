@@ -153,13 +153,21 @@ def test_a_share_of_the_draws_is_all_compliance(make_env):
 
 
 def test_a_late_command_is_mixed_with_the_one_before(make_env, robot):
+    """With the law of one step ago, and with no trace of that of two steps ago."""
     env = make_env(2, robot=robot, upper_body=both(LawConfig("cotap")))
-    drive(env, 3)
+    laws = []
+    for k in range(3):
+        drive(env, 1, seed=k)
+        laws.append(env.upper_body.newest)
     q, dq = of_arms(env, env.state.joint_pos) + 0.05, of_arms(env, env.state.joint_vel)
     ones = torch.ones_like(q)
-    new, old, half = (env.upper_body.torque(q, dq, torch.full((2,), share), ones, ones) for share in (1.0, 0.0, 0.5))
+    joints = [env.reader.arm_joints(torch.nn.functional.pad(x, (env.num_lower, 0))) for x in (q, dq, ones, ones)]
+    oldest, old, new = (law.at(*joints).flatten(1) for law in laws)
+    for share in (1.0, 0.75, 0.5, 0.0):
+        mixed = env.upper_body.torque(q, dq, torch.full((2,), share), ones, ones)
+        torch.testing.assert_close(mixed, share * new + (1.0 - share) * old, atol=1e-4, rtol=1e-4)
     assert float((new - old).abs().max()) > 0.05
-    torch.testing.assert_close(half, 0.5 * (new + old), atol=1e-4, rtol=1e-4)
+    assert float((oldest - old).abs().max()) > 0.05
 
 
 def test_gain_errors_leave_gravity_torques_alone(make_env, robot):

@@ -160,6 +160,32 @@ def test_measures_end_with_the_fall_and_never_include_what_follows():
     assert m["episode_length_fraction"].tolist() == pytest.approx([0.6, 1.0])
 
 
+def test_gait_errors_and_slopes_wait_for_an_average_that_holds_nothing_of_the_command_before():
+    """A robot that follows 1 s late, at once: right from 1 s on, its average over a stride of 0.8 s from 1.8 s on."""
+    t = trajectory(steps=300, envs=3)
+    t.command[150:, :, 0] = torch.tensor([-0.5, 0.0, 0.2])
+    t.command[150:, :, 2] = torch.tensor([-0.6, 0.0, 0.5])
+    t.velocity[200:] = t.command[200:]
+    m = tracking_measures(t, 0.8, settle_s=1.0)
+    for name in ("e_lin", "e_yaw", "e_lin_gait", "e_yaw_gait"):
+        assert m[name].tolist() == pytest.approx([0.0] * 3, abs=1e-6), name
+    slopes = tracking_slopes(t, 0.8, settle_s=1.0)
+    assert (slopes["slope_x"], slopes["slope_yaw"]) == pytest.approx((1.0, 1.0), abs=1e-6)
+    sooner = tracking_measures(t, 0.8, settle_s=0.9)
+    for name in ("e_lin", "e_yaw", "e_lin_gait", "e_yaw_gait"):
+        assert (sooner[name] > 1e-4).all(), name
+    assert tracking_slopes(t, 0.8, settle_s=0.9)["slope_x"] < 0.9999
+
+
+def test_slopes_are_of_robots_that_are_asked_to_walk_and_have_not_fallen():
+    t = trajectory(envs=4)
+    t.command[..., 0] = torch.tensor([-0.5, 1.0, 0.5, 0.0])
+    t.velocity[..., 0] = torch.tensor([-0.4, 0.8, 9.0, 0.7])
+    t.fell[0, 2] = True
+    t.stand[:, 3] = True
+    assert tracking_slopes(t, 0.8)["slope_x"] == pytest.approx(0.8, rel=1e-5)
+
+
 def test_stand_drift_is_the_mean_velocity_not_the_sway():
     standing = torch.ones(200, 2, dtype=torch.bool)
     t = trajectory(command=torch.zeros(200, 2, 3), stand=standing)
@@ -246,6 +272,15 @@ def test_summary_interval_covers_the_mean_at_its_stated_rate():
     assert 87 <= hits <= 100
     s = summarize(torch.tensor([1.0, 3.0, math.nan]))
     assert (s["mean"], s["std"]) == (2.0, pytest.approx(math.sqrt(2.0)))
+
+
+def test_summary_interval_is_of_95_percent():
+    """Of many equal numbers the mean is normal: 1.96 standard errors to either side; of 90 % it were 1.645."""
+    values = torch.randn(400, generator=torch.Generator().manual_seed(3)).double()
+    mean, error = float(values.mean()), float(values.std()) / math.sqrt(400)
+    low, high = summarize(values, resamples=20_000)["ci95"]
+    assert (mean - low) / error == pytest.approx(1.96, abs=0.06)
+    assert (high - mean) / error == pytest.approx(1.96, abs=0.06)
 
 
 def test_events_get_wilsons_interval():

@@ -1,0 +1,99 @@
+"""Displacements are told along the heading: MuJoCo's own positions of hands and torso, tilted torsos included."""
+
+from __future__ import annotations
+
+import math
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from cotap.envs import HumanoidEnv, HumanoidEnvConfig
+from cotap.envs.randomization import RandomizationConfig
+from cotap.evaluation.protocol import mirrored_pose
+from cotap.evaluation.rollout import trajectory_row
+from cotap.evaluation.static import StaticStiffness, settle
+
+
+def along_heading(data: mujoco.MjData, torso: str, vectors_w: np.ndarray) -> np.ndarray:
+    """World vectors (..., 3), turned back by the direction that the torso's x axis has on the ground."""
+    x_axis = data.body(torso).xmat.reshape(3, 3)[:, 0]
+    yaw = math.atan2(x_axis[1], x_axis[0])
+    turn = np.array([[math.cos(yaw), math.sin(yaw), 0.0], [-math.sin(yaw), math.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
+    return vectors_w @ turn.T
+
+
+def posed(model: mujoco.MjModel, qpos) -> mujoco.MjData:
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(model, data)
+    return data
+
+
+def hands_w(data: mujoco.MjData) -> np.ndarray:
+    return np.array([data.site(f"{side}_hand").xpos for side in ("left", "right")])
+
+
+def test_a_recorded_hand_is_off_its_reference_along_the_heading(make_env, robot):
+    env = make_env(3, robot=robot, randomization=RandomizationConfig(enabled=False))
+    rng = torch.Generator().manual_seed(2)
+    env.sim.qpos[:, 2] += 1.0
+    turned = torch.tensor([1.0, 0.0, 0.0, 0.0]) + torch.tensor([0.0, 0.15, 0.15, 0.6]) * torch.sign(
+        torch.randn(3, 4, generator=rng)
+    )
+    env.sim.qpos[:, 3:7] = torch.nn.functional.normalize(turned.double(), dim=1)
+    env.sim.qpos[:, 7 + env.num_lower :] += 0.3
+    env.state = env.reader.read()
+    _, _, done, extras = env.step(torch.zeros(3, env.num_actions))
+    assert not done.any()
+    row, torso = trajectory_row(env, extras["falls"]), env.spec.torso_body
+    for i in range(3):
+        state = env.sim.qpos[i].numpy()
+        data = posed(env.sim.model, state)
+        assert data.body(torso).xmat[8] < 0.99  # tilted
+        reference = state.copy()
+        reference[7 + env.num_lower :] = env.record.reference.position[i].numpy()
+        off_w = hands_w(data) - hands_w(posed(env.sim.model, reference))
+        np.testing.assert_allclose(row["hand_offset"][i], along_heading(data, torso, off_w), atol=2e-5)
+        assert np.abs(off_w).max() > 0.02
+
+
+@pytest.mark.parametrize("lean", [0.4, -0.3])
+def test_a_loaded_hand_moves_along_the_heading_of_a_torso_that_leans(lean):
+    """A waist that bends tilts the torso though the pelvis is held: the load is vertical, and so is what it does."""
+    protocol = StaticStiffness(num_envs=2, force=(0.0, 0.0, -5.0), levels=2, settle_seconds=3.0)
+    env = HumanoidEnv(protocol.configure(HumanoidEnvConfig("g1", num_threads=1)))
+    protocol.prepare(env)
+    side = protocol.load(env, torch.tensor([[0.0, 0.0, -5.0]]).expand(2, 3))
+    waist = env.spec.joint_names.index("waist_pitch_joint")
+    bend = torch.zeros(2, env.num_actions)
+    bend[:, waist] = lean / env.joint_targets.scale[waist]
+    settled = settle(env, lambda _: bend, 3.0, side)
+    half = round(3.0 / env.dt)
+    before, after = (posed(env.sim.model, settled.film[k - 1, : env.sim.model.nq].numpy()) for k in (half, 2 * half))
+    torso = env.spec.torso_body
+    assert math.asin(before.body(torso).xmat[2]) == pytest.approx(lean, abs=0.1)
+    # In the torso, which gives way itself, and as the torso was before the load.
+    where = [d.body(torso).xmat.reshape(3, 3).T @ (hands_w(d)[side] - d.body(torso).xpos) for d in (before, after)]
+    moved_w = before.body(torso).xmat.reshape(3, 3) @ (where[1] - where[0])
+    np.testing.assert_allclose(settled.moved[0], along_heading(before, torso, moved_w), atol=5e-5)
+    assert moved_w[2] < -0.005
+
+
+def test_a_pose_of_the_left_arm_is_mirrored_by_its_joints_signs(make_env):
+    """By hand, for the H1: shoulder pitch and elbow keep their signs, roll and yaw change them."""
+    env = make_env(1)
+    pose = mirrored_pose(env, (0.1, 0.2, 0.3, 0.4))
+    assert pose.tolist() == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.1, -0.2, -0.3, 0.4])
+    assert torch.equal(mirrored_pose(env, ()), env.motions.default)
+
+
+def test_a_pose_of_the_left_arm_puts_the_right_hand_at_its_mirror_image(make_env, robot):
+    env = make_env(1, robot=robot)
+    left = tuple(0.1 + 0.1 * k for k in range(len(env.spec.arms[0].joints)))
+    state = env.sim.model.qpos0.copy()
+    state[7:] = 0.0
+    state[7 + env.num_lower :] = mirrored_pose(env, left).numpy()
+    hands = hands_w(posed(env.sim.model, state))
+    np.testing.assert_allclose(hands[1], hands[0] * [1.0, -1.0, 1.0], atol=5e-5)
