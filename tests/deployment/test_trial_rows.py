@@ -15,6 +15,7 @@ from cotap.deployment.safety import SafetyConfig
 from cotap.deployment.scenario import ArmMotion, Scenario, TimedCommand
 from cotap.deployment.trial import run_trial
 from cotap.envs.commands import CommandConfig
+from cotap.envs.scripted_forces import ForceProfile
 from cotap.envs.upper_body import UpperBodyConfig
 
 ENGINE = EngineConfig(timestep=0.01, collision="feet", cone="pyramidal")
@@ -26,13 +27,36 @@ def hands_w(data: mujoco.MjData) -> np.ndarray:
     return np.array([data.site(f"{side}_hand").xpos for side in ("left", "right")])
 
 
-def test_rows_are_of_the_state_after_the_step_and_hands_along_the_heading(policy, spec):
-    """A robot that starts askew, arms off their pose: offsets in the world, turned back by the torso's yaw."""
-    robot = Robot(make_engine(ENGINE, spec), ENGINE, spec, 0.02, Perturbations(start_error=0.5))
-    motion = ArmMotion(pose=POSE).reference(spec, 0.02)
+def askew(robot: Robot) -> None:
+    """Turned by 2 rad, leaning by 0.2 rad, arms off the pose."""
+    quat = np.array([math.cos(1.0), 0.0, 0.0, math.sin(1.0)])
+    lean, turned = np.array([math.cos(0.1), 0.0, math.sin(0.1), 0.0]), np.zeros(4)
+    mujoco.mju_mulQuat(turned, quat, lean)
+    joints = np.array([j.default_rad for j in robot.spec.joints])
+    joints[11:] = np.array(POSE) + 0.3
+    robot.place(np.concatenate(([0.0, 0.0, robot.spec.base_height_m + 0.05], turned, joints)), np.zeros(6 + 19))
+
+
+def yaw_of(data: mujoco.MjData, torso: str) -> np.ndarray:
+    """From the world to the heading, (3, 3)."""
+    x, y, _ = data.body(torso).xmat.reshape(3, 3)[:, 0]
+    cos, sin = np.array([x, y]) / math.hypot(x, y)
+    return np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
+
+
+def test_rows_are_of_the_state_after_the_step_and_along_the_heading(policy, spec, monkeypatch):
+    """Offsets and forces in the world, turned by the torso's yaw; torques by MuJoCo's gravity and Jacobians."""
+    robot = Robot(make_engine(ENGINE, spec), ENGINE, spec, 0.02, Perturbations())
+    monkeypatch.setattr(robot, "start", lambda _joints, _seed: askew(robot))
+    motion, load = ArmMotion(pose=POSE).reference(spec, 0.02), np.array([8.0, -5.0, -12.0])
     controller = Controller(policy, spec, UpperBodyConfig(), CommandConfig(), motion, 0)
-    scenario = Scenario(0.2, arms=ArmMotion(pose=POSE), command=(TimedCommand(stand=True),))
-    trial = run_trial(robot, controller, scenario, SafetyConfig(ramp_s=0.0), seed=7)
+    scenario = Scenario(
+        0.2,
+        arms=ArmMotion(pose=POSE),
+        command=(TimedCommand(stand=True),),
+        force=(ForceProfile(tuple(load), "left", 0.0),),
+    )
+    trial = run_trial(robot, controller, scenario, SafetyConfig(ramp_s=0.0))
     assert len(trial.rows) == len(trial.qpos) == 10
     model, torso = robot.engine.model, spec.torso_body
     for row, qpos in zip(trial.rows, trial.qpos, strict=True):
@@ -40,15 +64,26 @@ def test_rows_are_of_the_state_after_the_step_and_hands_along_the_heading(policy
         now.qpos[:], wanted.qpos[:] = qpos, qpos
         wanted.qpos[ARMS] = POSE
         for data in (now, wanted):
-            mujoco.mj_kinematics(model, data)
-        x_axis = now.body(torso).xmat.reshape(3, 3)[:, 0]
-        yaw = math.atan2(x_axis[1], x_axis[0])
-        turn = np.array([[math.cos(yaw), math.sin(yaw), 0.0], [-math.sin(yaw), math.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
-        off_w = hands_w(now) - hands_w(wanted)
+            mujoco.mj_forward(model, data)
+        off_w, turn = hands_w(now) - hands_w(wanted), yaw_of(now, torso)
         np.testing.assert_allclose(row["hand_offset"][0], off_w @ turn.T, atol=1e-6)
         np.testing.assert_allclose(row["hand_error"][0], np.linalg.norm(off_w, axis=1), atol=1e-6)
         np.testing.assert_allclose(row["arm_error"][0], qpos[ARMS] - POSE, atol=1e-6)
         np.testing.assert_allclose(row["position"][0], now.body(torso).xpos[:2], atol=1e-6)
         assert float(row["height"]) == pytest.approx(now.body(torso).xpos[2], abs=1e-6)
+        felt = np.zeros(model.nv)
+        hand, body = now.site("left_hand").xpos, model.body(spec.arms[0].hand_body).id
+        mujoco.mj_applyFT(model, now, turn.T @ load, np.zeros(3), hand, body, felt)
+        np.testing.assert_allclose(row["arm_static_torque"][0], (now.qfrc_bias - felt)[6 + 11 :], atol=1e-5)
         assert now.body(torso).xmat[8] < 0.995
         assert np.abs(off_w).max() > 0.01
+
+
+def test_forces_on_hands_are_along_the_heading(spec, monkeypatch):
+    robot, given = Robot(make_engine(ENGINE, spec), ENGINE, spec, 0.02, Perturbations()), []
+    askew(robot)
+    turn = yaw_of(robot.engine.data, spec.torso_body)
+    monkeypatch.setattr(robot.engine, "advance", lambda _law, _steps, force_w: given.append(force_w))
+    forces_h = np.array([[8.0, -5.0, -12.0], [0.0, 3.0, 0.0]])
+    robot.act(robot.holding(np.zeros(19)), forces_h)
+    np.testing.assert_allclose(given[0], forces_h @ turn, atol=1e-9)

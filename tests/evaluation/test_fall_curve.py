@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 
 import pytest
 import torch
@@ -78,3 +79,16 @@ def test_the_command_prints_the_curve(checkpoint, tmp_path, capsys):
 def test_bad_options_are_named(options, message, capsys):
     assert main(["fall-curve", *options]) == 2
     assert message in capsys.readouterr().err
+
+
+def test_the_interval_of_the_half_point_is_of_95_percent():
+    """Nobody falls unpushed, a share p at 10 N s: half would at 5 / p, whose interval follows from p's normal one."""
+    level = torch.tensor([0, 1]).repeat_interleave(torch.tensor([100, 400]))
+    fell = torch.arange(500) >= 180  # 320 of the 400
+    fell[:100] = False
+    found = half_point(torch.tensor([0.0, 10.0]), level, fell, resamples=3000)
+    error = math.sqrt(0.8 * 0.2 / 400)
+    assert found["mean"] == pytest.approx(5.0 / 0.8)
+    low, high = found["ci95"]
+    assert (5.0 / low - 0.8) / error == pytest.approx(1.96, abs=0.13)
+    assert (0.8 - 5.0 / high) / error == pytest.approx(1.96, abs=0.13)

@@ -10,7 +10,9 @@ import pytest
 import torch
 
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
+from cotap.envs.external_forces import ExternalForceConfig
 from cotap.envs.randomization import RandomizationConfig
+from cotap.envs.scripted_forces import ForceProfile
 from cotap.evaluation.protocol import mirrored_pose
 from cotap.evaluation.rollout import trajectory_row
 from cotap.evaluation.static import StaticStiffness, settle
@@ -35,19 +37,27 @@ def hands_w(data: mujoco.MjData) -> np.ndarray:
     return np.array([data.site(f"{side}_hand").xpos for side in ("left", "right")])
 
 
-def test_a_recorded_hand_is_off_its_reference_along_the_heading(make_env, robot):
-    env = make_env(3, robot=robot, randomization=RandomizationConfig(enabled=False))
+@pytest.fixture
+def turning(make_env, robot):
+    """A step of robots in the air that lean, have turned and turn, arms off their reference, forces on their hands."""
+    load = ExternalForceConfig(scripted=ForceProfile((8.0, -5.0, -12.0), "left", 0.0))
+    env = make_env(3, robot=robot, randomization=RandomizationConfig(enabled=False), forces=load)
     rng = torch.Generator().manual_seed(2)
+    signs = torch.sign(torch.randn(3, 4, generator=rng))
+    turned = torch.tensor([1.0, 0.0, 0.0, 0.0]) + torch.tensor([0.0, 0.15, 0.15, 0.6]) * signs
     env.sim.qpos[:, 2] += 1.0
-    turned = torch.tensor([1.0, 0.0, 0.0, 0.0]) + torch.tensor([0.0, 0.15, 0.15, 0.6]) * torch.sign(
-        torch.randn(3, 4, generator=rng)
-    )
     env.sim.qpos[:, 3:7] = torch.nn.functional.normalize(turned.double(), dim=1)
     env.sim.qpos[:, 7 + env.num_lower :] += 0.3
+    env.sim.qvel[:, :6] = 1.5 * torch.randn(3, 6, generator=rng).double()
     env.state = env.reader.read()
     _, _, done, extras = env.step(torch.zeros(3, env.num_actions))
     assert not done.any()
-    row, torso = trajectory_row(env, extras["falls"]), env.spec.torso_body
+    return env, trajectory_row(env, extras["falls"])
+
+
+def test_a_recorded_hand_is_off_its_reference_along_the_heading(turning):
+    env, row = turning
+    torso = env.spec.torso_body
     for i in range(3):
         state = env.sim.qpos[i].numpy()
         data = posed(env.sim.model, state)
@@ -57,6 +67,36 @@ def test_a_recorded_hand_is_off_its_reference_along_the_heading(make_env, robot)
         off_w = hands_w(data) - hands_w(posed(env.sim.model, reference))
         np.testing.assert_allclose(row["hand_offset"][i], along_heading(data, torso, off_w), atol=2e-5)
         assert np.abs(off_w).max() > 0.02
+
+
+def test_a_recorded_velocity_is_the_torsos_along_the_heading_and_about_the_vertical(turning):
+    env, row = turning
+    model, torso, twist = env.sim.model, env.spec.torso_body, np.zeros(6)
+    for i in range(3):
+        data = posed(model, env.sim.qpos[i].numpy())
+        data.qvel[:] = env.sim.qvel[i].numpy()
+        mujoco.mj_forward(model, data)
+        mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, model.body(torso).id, twist, 0)
+        expected = along_heading(data, torso, twist[3:])
+        expected[2] = twist[2]
+        np.testing.assert_allclose(row["velocity"][i], expected, atol=1e-4)
+        about_own_axis = data.body(torso).xmat.reshape(3, 3)[:, 2] @ twist[:3]
+        assert abs(about_own_axis - twist[2]) > 0.005  # which is not the same
+
+
+def test_the_torque_that_statics_asks_of_the_arms_is_gravitys_less_the_loads(turning):
+    env, row = turning
+    model = env.sim.model
+    for i in range(3):
+        data = posed(model, env.sim.qpos[i].numpy())
+        mujoco.mj_forward(model, data)  # at rest: what is left of the bias is gravity
+        felt = np.zeros(model.nv)
+        for arm, force in zip(env.spec.arms, env.hand_force_w[i].double().numpy(), strict=True):
+            body = model.body(arm.hand_body).id
+            mujoco.mj_applyFT(model, data, force, np.zeros(3), data.site(f"{arm.side}_hand").xpos, body, felt)
+        expected = (data.qfrc_bias - felt)[6 + env.num_lower :]
+        np.testing.assert_allclose(row["arm_static_torque"][i], expected, atol=1e-3)
+        assert np.abs(felt[6 + env.num_lower :]).max() > 1.0
 
 
 @pytest.mark.parametrize("lean", [0.4, -0.3])
