@@ -216,16 +216,18 @@ def is_guided(path: Path) -> None:
 
 @pytest.mark.parametrize("use", [evaluates, plays, exports, goes_on, is_guided])
 @pytest.mark.parametrize("value", [math.nan, -math.inf])
-@pytest.mark.parametrize("part", ["actors", "critics", "normalizers", "moments"])
+@pytest.mark.parametrize("part", ["actors", "critics", "normalizers", "moments", "rate"])
 def test_weights_that_are_not_finite_are_refused_by_name(trained: Trained, use: Any, value: float, part: str):
     """Whoever loads them, and whether it needs them or not."""
     content = copy.deepcopy(trained.content)
-    if part == "moments":
-        weights, name = content["learner"]["optimizers"]["lower"]["state"][0], "exp_avg"
+    if part == "rate":
+        weights, name = content["learner"]["optimizers"]["upper"]["param_groups"][0], "lr"
+        weights[name] = value
     else:
-        weights = content["model"]
-        name = next(n for n, v in weights.items() if n.startswith(part) and v.is_floating_point() and v.dim())
-    weights[name].view(-1)[0] = value
+        weights = content["learner"]["optimizers"]["lower"]["state"][0] if part == "moments" else content["model"]
+        begins = "exp_avg" if part == "moments" else part
+        name = next(n for n, v in weights.items() if n.startswith(begins) and v.is_floating_point() and v.dim())
+        weights[name].view(-1)[0] = value
     path = trained.folder / "nan.pt"
     save_checkpoint(path, content)
     with pytest.raises(CheckpointError, match=rf"nan\.pt' has weights that are not finite: .*{name}$"):
@@ -268,6 +270,20 @@ def test_a_changed_policy_is_used_or_refused(trained: Trained, use: Any, draw: s
         use(path)
     except ValueError as error:
         assert "policy.pt" in str(error)  # noqa: PT017
+
+
+def test_a_checkpoint_does_not_say_how_its_optimisers_step(trained: Trained):
+    """One that climbs instead of descending, say, or forgets at another rate."""
+    content, path = copy.deepcopy(trained.content), trained.folder / "climbs.pt"
+    for optimizer in content["learner"]["optimizers"].values():
+        optimizer["param_groups"][0] |= {"maximize": True, "betas": (0.5, 5.0), "eps": 1.0, "weight_decay": 1e3}
+    save_checkpoint(path, content)
+    trained.runner.load(str(path))
+    for optimizer in trained.runner.alg.optimizers.values():
+        (group,) = optimizer.param_groups
+        assert (group["maximize"], group["betas"], group["eps"], group["weight_decay"]) == (
+            False, (0.9, 0.999), 1e-8, 0.0
+        )  # fmt: skip
 
 
 STATES = [
@@ -492,51 +508,6 @@ def test_a_scenario_with_changed_bytes_is_used_or_refused(
     path = tmp_path / "changed.toml"
     path.write_bytes(changed_bytes(SCENARIO.encode(), draw))
     deploys(["--policy", str(good_files / "good.onnx"), "--scenario", str(path)], "changed.toml|clip", capsys)
-
-
-@pytest.mark.parametrize("value", [math.nan, math.inf])
-@pytest.mark.parametrize("raw", [True, False])
-def test_an_onnx_file_with_weights_that_are_not_finite_is_refused_by_name(
-    good_files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], value: float, raw: bool
-):
-    """In every weight that it has, however it is written."""
-    proto = onnx.load(good_files / "good.onnx")
-    for i, weight in enumerate(proto.graph.initializer):
-        numbers = onnx.numpy_helper.to_array(weight)
-        if numbers.dtype.kind != "f":
-            continue
-        changed = onnx.ModelProto.FromString(proto.SerializeToString())
-        numbers = numbers.copy()
-        numbers.reshape(-1)[-1] = value
-        made = onnx.numpy_helper.from_array(numbers, weight.name)
-        if not raw:
-            made = onnx.helper.make_tensor(weight.name, weight.data_type, weight.dims, numbers.reshape(-1).tolist())
-        changed.graph.initializer[i].CopyFrom(made)
-        onnx.save(changed, tmp_path / "bad.onnx")
-        assert deploy.main(["--policy", str(tmp_path / "bad.onnx")]) == 2
-        said = capsys.readouterr().err
-        assert "bad.onnx' cannot be read as ONNX: its weight " in said
-        assert said.endswith("is not finite\n")
-
-
-@pytest.mark.parametrize("key", [b"\x0a\x08location", b"\x0a\x88\x00location"])
-@pytest.mark.usefixtures("in_tmp_path")
-def test_weights_in_another_file_are_not_read(good_files: Path, capsys: pytest.CaptureFixture[str], key: bytes):
-    """Beside the policy or where the command runs; the length of a key may be written in more than one way."""
-    proto = onnx.load(good_files / "good.onnx")
-    onnx.save(proto, "outside.onnx", save_as_external_data=True, location="weights.bin", size_threshold=0)
-    assert Path("weights.bin").exists()
-    data = Path("outside.onnx").read_bytes()
-    if key != b"\x0a\x08location":
-        tensor = onnx.TensorProto(name="w", data_type=1, dims=[1], data_location=1).SerializeToString()
-        entry = key + b"\x12\x0bweights.bin"
-        tensor += b"\x6a" + bytes([len(entry)]) + entry
-        graph = b"\x2a" + bytes([len(tensor)]) + tensor
-        data = (good_files / "good.onnx").read_bytes() + b"\x3a" + bytes([len(graph)]) + graph
-        assert onnx.ModelProto.FromString(data).graph.initializer[-1].external_data[0].key == "location"
-    Path("outside.onnx").write_bytes(data)
-    assert deploy.main(["--policy", "outside.onnx"]) == 2
-    assert "'outside.onnx' cannot be read as ONNX: its weights lie in another file" in capsys.readouterr().err
 
 
 def as_toml(value: Any) -> str:

@@ -6,6 +6,7 @@ import contextlib
 import hashlib
 import io
 import json
+import math
 import pickle
 import re
 import warnings
@@ -101,14 +102,16 @@ def load_checkpoint(path: Path | str, device: str = "cpu") -> dict[str, Any]:
 
 
 def _require_finite(path: Path, content: dict[str, Any]) -> None:
-    """Raise CheckpointError naming a tensor of the networks or their optimisers that claims more numbers than it holds,
-    or has one that is not finite."""
+    """Raise CheckpointError naming a number of the networks or their optimisers that is not finite, or a tensor that
+    claims more numbers than it holds."""
     left: list[tuple[str, Any]] = [(part, content.get(part)) for part in ("model", "learner")]
     seen: set[int] = set()  # a list may lie in itself, or in many places
     while left:
         where, value = left.pop()
         if isinstance(value, torch.Tensor):
             _require_finite_tensor(f"checkpoint {str(path)!r} has", where, value)
+        elif isinstance(value, float) and not math.isfinite(value):
+            raise CheckpointError(f"checkpoint {str(path)!r} has weights that are not finite: {where}")
         elif isinstance(value, (dict, list, tuple)) and id(value) not in seen:
             seen.add(id(value))
             items = value.items() if isinstance(value, dict) else enumerate(value)

@@ -326,7 +326,8 @@ class DualPPO:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take over what `state_dict` returned. Raises ValueError for moments of another size than the weights."""
         for name, opt in self.optimizers.items():
-            opt.load_state_dict(state["optimizers"][name])
+            # How Adam steps is its own affair; what it has learned comes from the file.
+            opt.load_state_dict(opt.state_dict() | {"state": state["optimizers"][name]["state"]})
             for parameter, moments in opt.state.items():
                 for key in ("exp_avg", "exp_avg_sq"):
                     require_shape(f"optimizers.{name}.{key}", moments[key], tuple(parameter.shape))

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,11 +16,13 @@ import numpy as np
 
 from cotap.checks import reason_of, shortened
 from cotap.deployment.metadata import INPUT, TARGETS, PolicyError, PolicyMetadata, read_metadata
-from cotap.deployment.onnx_file import require_plain_weights
+from cotap.deployment.onnx_file import require_plain_graph
 from cotap.inputs import InputError, read_bytes
 
 _LARGEST = 2 << 30
 """Bytes that an ONNX file can have."""
+FIRST_S = 10.0
+"""How long a policy's first inference may take, thousands of times what it should [s]."""
 
 
 class OnnxPolicy:
@@ -29,8 +32,8 @@ class OnnxPolicy:
         path: What `python -m cotap.export` wrote.
 
     Raises:
-        PolicyError: the file is missing, is not ONNX, has weights in another file or not finite, lacks metadata, or is
-            another network than that describes.
+        PolicyError: the file is missing, is not ONNX, has weights in another file or not finite, or loops, lacks
+            metadata, is another network than that describes, or takes longer than `FIRST_S`.
         ModuleNotFoundError: onnxruntime is not installed.
     """
 
@@ -49,8 +52,12 @@ class OnnxPolicy:
         options.log_severity_level = 4  # what goes wrong is raised; it need not be printed as well
         options.add_session_config_entry("session.load_model_format", "ONNX")  # not onnxruntime's own
         try:
-            require_plain_weights(data)
-            self._session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+            require_plain_graph(data)
+            # As a rule what is constant is worked out while loading, which nothing could end: not before that is known
+            # to take no longer than an inference may.
+            self._session = onnxruntime.InferenceSession(
+                data, options, providers=["CPUExecutionProvider"], disabled_optimizers=["ConstantFolding"]
+            )
             properties = self._session.get_modelmeta().custom_metadata_map
             inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
         except Exception as error:  # onnxruntime's errors share no base but this
@@ -63,6 +70,8 @@ class OnnxPolicy:
         self._default = np.array(self.metadata.default_pose_rad)
         self._scale = np.array(self.metadata.action["scale_rad"])
         self._residual = self.metadata.action["upper_mode"] == "residual"
+        self._infer_within(where, FIRST_S)
+        self._session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """Joint targets (J,) [rad], float64, of an observation (width,); with residual arms, of the reference that was
@@ -80,6 +89,22 @@ class OnnxPolicy:
     def action(self, targets: np.ndarray, arm_reference: np.ndarray) -> np.ndarray:
         """The action (J,) behind targets (J,) [rad] that were sent with the arms' reference (U,) [rad]."""
         return (targets - self.offset(arm_reference)) / self._scale
+
+    def _infer_within(self, where: str, seconds: float) -> None:
+        """One inference. Raises PolicyError if it fails, or takes longer."""
+        import onnxruntime
+
+        options = onnxruntime.RunOptions()
+        timer = threading.Timer(seconds, setattr, (options, "terminate", True))
+        timer.start()
+        try:
+            self._session.run([TARGETS], {INPUT: self._input}, options)
+        except Exception as error:  # as above
+            late = options.terminate
+            reason = f"took more than {seconds:g} s" if late else f"failed: {shortened(reason_of(error))}"
+            raise PolicyError(f"{where} cannot be used: its first inference {reason}") from error
+        finally:
+            timer.cancel()
 
     @staticmethod
     def _require(where: str, kind: str, found: Sequence[Any], wanted: dict[str, list[int]]) -> None:
