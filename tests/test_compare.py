@@ -112,7 +112,7 @@ def test_envs_that_are_none_are_refused(tmp_path, capsys, envs, named):
     ("measure", "b", "shown", "b_is"),
     [("e_torso", 1.5, "e_torso (less)", "worse"), ("force_e_ee", 0.5, "force_e_ee (less)", "better"),
      ("still_share", 1.5, "still_share (more)", "better"),
-     ("seconds_upright", 0.5, "seconds_upright (more)", "worse"),
+     ("survival_s", 0.5, "survival_s (more)", "worse"),
      ("displacement_x", 0.5, "displacement_x", "less"), ("e_yaw", 1.01, "e_yaw (less)", "not distinguishable")],
 )  # fmt: skip
 def test_what_is_better_is_said(measure, b, shown, b_is):
@@ -182,7 +182,7 @@ def test_files_that_are_no_evaluations_are_named(text, tmp_path, capsys):
 def test_other_protocols_are_not_compared(tmp_path, capsys):
     a, b = tmp_path / "a.json", tmp_path / "b.json"
     a.write_text(json.dumps(result()))
-    b.write_text(json.dumps(result() | {"protocol": "punches"}))
+    b.write_text(json.dumps(result() | {"protocol": "tour"}))
     assert main([str(a), str(b)]) == 2
-    assert "protocols differ: 'impact' and 'punches'" in capsys.readouterr().err
+    assert "protocols differ: 'impact' and 'tour'" in capsys.readouterr().err
     assert main([str(a), str(tmp_path / "none.json")]) == 2

@@ -21,11 +21,11 @@ from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.modulation import Modulation
 from cotap.evaluation.periodic import PeriodicLoad
 from cotap.evaluation.protocol import Protocol, RolloutProtocol
-from cotap.evaluation.punches import PunchWalk
 from cotap.evaluation.recording import RecordingProtocol
 from cotap.evaluation.report import require_outputs, sheet_path
 from cotap.evaluation.stability import Stability
 from cotap.evaluation.static import StaticStiffness
+from cotap.evaluation.tour.protocol import Tour
 from cotap.evaluation.velocity_tracking import VelocityTracking
 from cotap.files import require_output
 
@@ -45,7 +45,7 @@ PROTOCOLS: dict[str, type[Protocol]] = {
     "impact": Impact,
     "constant-load": ConstantLoad,
     "periodic-load": PeriodicLoad,
-    "punches": PunchWalk,
+    "tour": Tour,
     "fall-curve": FallCurve,
     "modulation": Modulation,
 }
@@ -161,14 +161,14 @@ def prepare(options: Options[Protocol]) -> tuple[HumanoidEnv, Policy, str]:
 
 
 def arms_of(options: Options[Protocol], policy: Policy) -> UpperBodyConfig:
-    """The laws of the arms: those of the options, else those that the policy was trained with, else the protocol's.
+    """The laws of the arms: those of the options, else those that the policy was trained with or the protocol's own.
 
     Raises:
         ValueError: an option of the laws is out of its range, or neither arm's law reads it.
     """
     trained = policy.env_config.upper_body
     under_pd = policy.stage == "base" and trained.left.name == trained.right.name == "pd"
-    if under_pd and options.laws.method is None:
+    if options.laws.method is None and (under_pd or options.protocol.laws_for_all):
         trained = options.protocol.laws.configure(trained)
     return options.laws.configure(trained)
 

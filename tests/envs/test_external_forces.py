@@ -21,10 +21,6 @@ def scripted(profile: ForceProfile) -> ExternalForceConfig:
     return ExternalForceConfig(scripted=profile)
 
 
-def arm_links(spec) -> list[str]:
-    return [link.name for arm in spec.arms for link in spec.chain(arm.hand_body, spec.torso_body)]
-
-
 def hands(env, model, data, index: int) -> np.ndarray:
     """Generalised forces (nv,) of the forces that the environment says are on the hands."""
     out = np.zeros(model.nv)
@@ -64,30 +60,31 @@ def test_scripted_forces_turn_with_the_robot(make_env, robot):
 
 
 def test_a_punch_acts_at_the_joint_that_is_struck(make_env, robot):
-    """With a load in the same hand."""
-    links = arm_links(make_env(1, robot=robot).spec)
-    n = len(links)
+    """Every joint of the robot in turn, with a load in the hands."""
+    n = len(make_env(1, robot=robot).spec.joints)
     load = ForceProfile((5.0, -3.0, -20.0), "both", 0.0)
-    env = make_env(n, robot=robot, forces=ExternalForceConfig(punches=PunchConfig(600.0, 0.08, 0.08), scripted=load))
-    env.forces.punches.joint = torch.arange(n)
+    env = make_env(n, robot=robot, forces=ExternalForceConfig(punches=PunchConfig(600.0, first_s=0.0), scripted=load))
+    drive(env, 2, scale=0.1)
+    env.forces.punches.joint[:, 0] = torch.arange(n)
     env.forces.apply(env.sim.xfrc, env.state, torch.zeros(n), 0.0)
-    punch_w = env.forces.punches.current()
-    assert (punch_w.norm(dim=2) > 0.0).sum(1).tolist() == [1] * n
-    for i, link in enumerate(links):
+    _, punch_w = env.forces.punches.at(torch.zeros(n))
+    assert (punch_w.norm(dim=1) > 90.0).all()
+    for i, joint in enumerate(env.spec.joint_names):
         model, data = mujoco_of(env, i)
+        link = model.joint(joint).bodyid[0]
         expected = hands(env, model, data, i)
-        expected += at_point(model, data, link, data.body(link).xpos, punch_w[i, i].numpy())
+        expected += at_point(model, data, model.body(link).name, data.joint(joint).xanchor, punch_w[i].numpy())
         np.testing.assert_allclose(felt(model, data, env.sim.xfrc[i]), expected, atol=1e-2)
 
 
 def test_a_punch_is_over_when_it_is_over(make_env, robot):
-    env = make_env(4, robot=robot, forces=ExternalForceConfig(punches=PunchConfig(300.0, 0.04, 0.2)))
+    punches = PunchConfig(300.0, 0.04, 0.2, first_s=0.06)
+    env = make_env(4, robot=robot, forces=ExternalForceConfig(punches=punches))
     struck = []
     for _ in range(10):
         env.step(zeros(env))
         struck.append(env.sim.xfrc.abs().amax((1, 2)) > 0.0)
-    count = torch.stack(struck).sum(0)
-    assert ((count == 2) | (count == 3)).all()
+    assert torch.stack(struck).T.tolist() == [[False] * 3 + [True] * 2 + [False] * 5] * 4
 
 
 def test_all_sources_add_up(make_env, robot):
@@ -95,7 +92,7 @@ def test_all_sources_add_up(make_env, robot):
     env = make_env(
         4, robot=robot, forces=ExternalForceConfig(
             HandLoadConfig(enabled=True, episode_share=1.0), PushConfig(enabled=True, episode_share=1.0),
-            PunchConfig(200.0, 0.08, 0.08), ForceProfile((40.0, 0.0, 10.0), "left", 0.0, place="base"),
+            PunchConfig(200.0, first_s=0.0), ForceProfile((40.0, 0.0, 10.0), "left", 0.0, place="base"),
         ),
     )  # fmt: skip
     drive(env, 2, scale=0.1)
@@ -103,12 +100,14 @@ def test_all_sources_add_up(make_env, robot):
     sources.pushes.place[:], sources.pushes._left_s[:] = torch.tensor([0, 1, 2, 3 + 4]), 1.0
     sources.pushes.force_w[:] = torch.tensor([50.0, -80.0, 10.0])
     env.forces.apply(env.sim.xfrc, env.state, torch.zeros(4), 0.0)
-    links, base = arm_links(spec), spec.base_body
+    base = spec.base_body
     for i in range(4):
         model, data = mujoco_of(env, i)
         expected = hands(env, model, data, i)
-        for link, force in zip(links, sources.punches.current()[i], strict=True):
-            expected += at_point(model, data, link, data.body(link).xpos, force.numpy())
+        joint, punch_w = (part[i] for part in sources.punches.at(torch.zeros(4)))
+        struck = model.joint(spec.joint_names[joint])
+        link = model.body(struck.bodyid[0]).name
+        expected += at_point(model, data, link, data.joint(struck.name).xanchor, punch_w.numpy())
         on_base = env.state.heading_w[i] @ torch.tensor([40.0, 0.0, 10.0])
         expected += at_point(model, data, base, data.body(base).xipos, on_base.numpy())
         pushed = {0: base, 3: spec.bodies[4].name}.get(i)

@@ -17,7 +17,7 @@ PROTOCOLS = {
                   "--settle-seconds", "0.2", "--change-seconds", "0.1"],
     "static-stiffness": ["--method", "cotap", "--threads", "1", "--num-envs", "2",
                          "--levels", "2", "--settle-seconds", "2.0"],
-    "punches": [*COMPLIANT, "--episode-seconds", "1.0"],
+    "tour": [*COMPLIANT, "--episode-seconds", "1.0", "--waypoints", "2"],
     "fall-curve": [*COMPLIANT, "--levels", "2", "--onset", "0.5", "--window", "0.0", "0.2", "--fall-seconds", "0.2",
                    "--episode-seconds", "0.8"],
     "modulation": [*COMPLIANT, "--onset", "0.5", "--window", "0.0", "0.2", "--fall-seconds", "0.2",

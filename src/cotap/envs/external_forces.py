@@ -16,6 +16,7 @@ from cotap.envs.pushes import PushConfig, Pushes
 from cotap.envs.scripted_forces import ForceProfile, ScriptedForces
 from cotap.envs.state import RobotState, StateReader
 from cotap.robots import RobotSpec
+from cotap.robots.chains import LinkRotations
 from cotap.rotations import rotate
 
 
@@ -52,11 +53,12 @@ class ExternalForces:
         torque_limit: torch.Tensor, num_envs: int, dt: float,
     ) -> None:  # fmt: skip
         self._cfg, self._dt, self._chains, self._torque_limit = cfg, dt, reader.arm_chains, torque_limit
-        arms = [spec.chain(arm.hand_body, spec.torso_body) for arm in spec.arms]
-        links = [link for arm in arms for link in arm]
         self._hand_bodies = [model.body(arm.hand_body).id for arm in spec.arms]
-        self._arm_bodies = [model.body(link.name).id for link in links]
-        self._arm_coms = torch.tensor([link.com for link in links])
+        links = {body.joint: body for body in spec.bodies}
+        struck = [links[name] for name in spec.joint_names]
+        self._joint_bodies = torch.tensor([model.body(link.name).id for link in struck])
+        self._joint_coms = torch.tensor([link.com for link in struck])
+        self._link_rotations = LinkRotations(spec)
         self._hand_levers = torch.stack(
             [torch.tensor(arm.hand_point) - torch.tensor(spec.body(arm.hand_body).com) for arm in spec.arms]
         )
@@ -68,15 +70,15 @@ class ExternalForces:
         self._base = base
         self.hand_loads = HandLoads(cfg.hand_loads, hands, num_envs, dt)
         self.pushes = Pushes(cfg.pushes, hands, len(moving), spec.mass_kg, num_envs, dt)
-        self.punches = Punches(cfg.punches, num_envs, len(links), dt)
+        self.punches = Punches(cfg.punches, len(spec.joints), num_envs, dt)
         self.scripted = ScriptedForces(cfg.scripted, tuple(arm.side for arm in spec.arms), num_envs, dt)
         self.hand_force_w = torch.zeros(num_envs, hands, 3)
         """(N, H, 3) force at each hand in the last step, world frame [N]."""
 
     @property
     def parts(self) -> dict[str, Any]:
-        """The sources, which have a state, by name."""
-        return {name: getattr(self, name) for name in ("hand_loads", "pushes", "punches", "scripted")}
+        """The sources that have a state, by name."""
+        return {name: getattr(self, name) for name in ("hand_loads", "pushes", "scripted")}
 
     def reset(self, mask: torch.Tensor, rng: torch.Generator) -> None:
         """Episodes begin in the envs of `mask`."""
@@ -88,7 +90,6 @@ class ExternalForces:
         """Advance the sources by one control step."""
         self.hand_loads.step(rng)
         self.pushes.step(samples, rng)
-        self.punches.step(rng)
 
     def apply(self, xfrc: torch.Tensor, s: RobotState, time_s: torch.Tensor, samples: float) -> None:
         """Write the wrenches of the coming control step.
@@ -113,7 +114,7 @@ class ExternalForces:
         if self._cfg.pushes.enabled:
             self._push(xfrc)
         if self.punches.active:
-            self._punch(xfrc, s)
+            self._punch(xfrc, s, time_s)
         lever_w = rotate(s.torso_rotation_w.unsqueeze(1) @ s.arms.rotation, self._hand_levers)
         wrench = torch.cat((self.hand_force_w, torch.linalg.cross(lever_w, self.hand_force_w)), 2).to(xfrc)
         for i, body in enumerate(self._hand_bodies):
@@ -128,10 +129,12 @@ class ExternalForces:
         elsewhere = ~on_hand.any(1, keepdim=True) * force_w
         xfrc[rows, self._place_bodies[place], :3] += elsewhere.to(xfrc)
 
-    def _punch(self, xfrc: torch.Tensor, s: RobotState) -> None:
-        """Punches act at the arms' joints, which are the origins of the links' frames."""
-        rotations_w = (s.torso_rotation_w[:, None, None] @ s.arms.rotations).flatten(1, 2)
-        force_w, lever_w = self.punches.current(), -rotate(rotations_w, self._arm_coms)
-        wrench = torch.cat((force_w, torch.linalg.cross(lever_w, force_w)), 2).to(xfrc)
-        for i, body in enumerate(self._arm_bodies):
-            xfrc[:, body] += wrench[:, i]
+    def _punch(self, xfrc: torch.Tensor, s: RobotState, time_s: torch.Tensor) -> None:
+        """Punches act at joints, which are the origins of the links' frames."""
+        joint, force_w = self.punches.at(time_s)
+        if not force_w.any():
+            return
+        rows = torch.arange(len(joint), device=joint.device)
+        rotation_w = self._link_rotations(s.base_rotation_w, s.joint_pos)[rows, joint]
+        lever_w = -rotate(rotation_w, self._joint_coms[joint])
+        xfrc[rows, self._joint_bodies[joint]] += torch.cat((force_w, torch.linalg.cross(lever_w, force_w)), 1).to(xfrc)

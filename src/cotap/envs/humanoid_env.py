@@ -126,10 +126,10 @@ class HumanoidEnv(VecEnv):
         own = {"robot": self.spec.name, "joints": self.spec.joint_names, "control_dt": self.cfg.control_dt}
         return json.loads(json.dumps(own | self.observer.layout() | {"actions": vars(self.cfg.actions)}))
 
-    def reset(self) -> TensorDict:
-        """Restart every env and return the observations."""
+    def reset(self, start: tuple[torch.Tensor, torch.Tensor] | None = None) -> TensorDict:
+        """Restart every env, from `qpos` (N, 7 + J) and `qvel` (N, 6 + J) if given; return the observations."""
         everyone = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
-        self._restart(everyone)
+        self._restart(everyone, start)
         return self._observe(everyone)
 
     def reset_identical(self, seed: int) -> TensorDict:
@@ -228,12 +228,12 @@ class HumanoidEnv(VecEnv):
         log["/curriculum/assist"] = torch.tensor(self.cfg.assist.share(self.samples))
         return torch.stack(totals, 1), log
 
-    def _restart(self, mask: torch.Tensor) -> None:
-        """Begin new episodes in the envs of `mask` (N,)."""
+    def _restart(self, mask: torch.Tensor, start: tuple[torch.Tensor, torch.Tensor] | None = None) -> None:
+        """Begin new episodes in the n envs of `mask` (N,), from `qpos` (n, 7 + J) and `qvel` (n, 6 + J) if given."""
         self.randomizer.randomize_episode(mask, self.actuation.delay_s, self.rng)
         for part in (self.commands, self.motions, self.upper_body, self.forces):
             part.reset(mask, self.rng)
-        qpos, qvel = start_state(self.cfg, self.spec, self.motions.current().position[mask], self.rng)
+        qpos, qvel = start or start_state(self.cfg, self.spec, self.motions.current().position[mask], self.rng)
         self.sim.reset(mask, qpos, qvel)
         self.actuation.reset(mask, qpos[:, 7:])
         for held in (self.observer, self.recorder):

@@ -99,6 +99,11 @@ class Randomizer(Stateful):
         for geom in self._foot_geoms:
             friction[mask, geom, 0] = sliding.to(friction)
 
+    def set_nominal_gains(self, joints: slice, kp: torch.Tensor, kd: torch.Tensor) -> None:
+        """Give `joints` other nominal gains (n,) [Nm/rad, Nms/rad] than the robot's, in all envs."""
+        self._kp[joints], self._kd[joints] = kp.to(self._kp), kd.to(self._kd)
+        self.write_gains(torch.ones(len(self.kp_scale), dtype=torch.bool, device=self.kp_scale.device))
+
     def write_gains(self, mask: torch.Tensor) -> None:
         """Bring the actuators' gains of the envs in `mask` in line with the scales."""
         bias = self._sim.field("actuator_biasprm")

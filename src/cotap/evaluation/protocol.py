@@ -30,6 +30,8 @@ class Protocol(ABC):
 
     laws: ClassVar[LawOptions] = LawOptions()
     """Laws of the arms where the command line names none and the policy was trained under PD."""
+    laws_for_all: ClassVar[bool] = False
+    """Whether `laws` are the default of policies that were trained under others too."""
     drives: ClassVar[dict[str, str]] = {}
     """Fields of laws that the protocol sets itself, each with the option that says how."""
 

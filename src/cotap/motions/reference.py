@@ -154,9 +154,13 @@ class ReferenceMotion(Stateful):
 
     def hold(self, pose: torch.Tensor) -> None:
         """Hold `pose` (U,) or (N, U) in all envs until further notice."""
+        self.place(pose, torch.zeros_like(self._velocity))
+
+    def place(self, position: torch.Tensor, velocity: torch.Tensor) -> None:
+        """Be at `position` (U,) or (N, U) [rad], moving at `velocity` (N, U) [rad/s], until it is placed elsewhere."""
         self._fixed = True
-        self._position = pose.to(self._position.device).expand_as(self._position).clone()
-        self._velocity = torch.zeros_like(self._velocity)
+        self._position = position.to(self._position).expand_as(self._position).clone()
+        self._velocity = velocity.to(self._velocity)
 
     def reset(self, mask: torch.Tensor, rng: torch.Generator) -> None:
         """Start the envs of `mask` anew, with no memory of what they did."""

@@ -24,6 +24,26 @@ def chains_between(
     )
 
 
+class LinkRotations:
+    """Orientations of the links, by the joint that moves each."""
+
+    def __init__(self, spec: RobotSpec) -> None:
+        parents = {b.parent for b in spec.bodies}
+        leaves = [b.name for b in spec.bodies if b.name not in parents and b.name != spec.base_body]
+        chains = [(chains_between(spec, spec.base_body, [(leaf, (0.0, 0.0, 0.0))]), leaf) for leaf in leaves]
+        self._chains = [
+            (chain, torch.tensor(spec.indices([b.joint or "" for b in spec.chain(leaf, spec.base_body)])))
+            for chain, leaf in chains
+        ]
+
+    def __call__(self, base_w: torch.Tensor, joint_pos: torch.Tensor) -> torch.Tensor:
+        """(N, J, 3, 3) link to world, for a base at `base_w` (N, 3, 3) and joints at (N, J) [rad]."""
+        out = base_w.unsqueeze(1).repeat(1, joint_pos.shape[1], 1, 1)
+        for chain, joints in self._chains:
+            out[:, joints] = base_w.unsqueeze(1) @ chain.pose(joint_pos[:, None, joints]).rotations[:, 0]
+        return out
+
+
 def arm_chains(spec: RobotSpec, dtype: torch.dtype = torch.float32) -> SerialChains:
     """The arms, from the torso link to the hand points."""
     return chains_between(spec, spec.torso_body, [(a.hand_body, a.hand_point) for a in spec.arms], dtype)
