@@ -93,7 +93,7 @@ def main(argv: list[str] | None = None) -> int:
         return 0 if args else 2
     try:
         evaluate(args)
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, ModuleNotFoundError) as error:
         print(f"error: {shortened(str(error))}", file=sys.stderr)
         return 2
     return 0
@@ -178,7 +178,7 @@ def run(name: str, options: Options[Protocol]) -> dict[str, Any]:
     protocol = options.protocol
     env, policy, digest = prepare(options)
     start = time.perf_counter()
-    measured = protocol.evaluate(env, policy)
+    measured = _measured(options, env, policy)
     settings = to_plain(protocol) | to_plain(options.laws)
     result = {
         "protocol": name,
@@ -196,6 +196,15 @@ def run(name: str, options: Options[Protocol]) -> dict[str, Any]:
     if options.video:
         protocol.video(Path(options.video), sheet_path(options.video), env, policy)
     return result
+
+
+def _measured(options: Options[Protocol], env: HumanoidEnv, policy: Policy) -> dict[str, Any]:
+    """What the protocol finds, in the engine that it names if it names one."""
+    if isinstance(options.protocol, Tour) and options.protocol.engine != "mujoco":
+        from cotap.deployment.tour import evaluate_in_engine
+
+        return evaluate_in_engine(options.protocol, _checkpoint(options), env.cfg)
+    return options.protocol.evaluate(env, policy)
 
 
 def recording(options: RecordingOptions) -> dict[str, Any]:

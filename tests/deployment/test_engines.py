@@ -10,14 +10,13 @@ import pytest
 import torch
 
 from cotap.compliance.dynamics import joint_inertia
-from cotap.deployment.engines import EngineConfig, EngineState, make_engine
+from cotap.deployment.engines import EngineConfig, EngineState, PointForce, make_engine
 from cotap.deployment.joint_law import damped_law, pd_law
 from cotap.deployment.rotors import rotor_inertias, with_rotors
 from cotap.envs.state import StateReader
 from cotap.robots.chains import arm_chains, arm_inertias
 
 ENGINES = ["mujoco", "pybullet"]
-FREE = np.zeros((2, 3))
 
 
 @pytest.fixture
@@ -78,7 +77,7 @@ def test_flight_keeps_momentum_and_falls_with_g(engine, model, gains):
         mujoco.mj_kinematics(model, reference)
         mujoco.mj_comPos(model, reference)
         heights.append(reference.subtree_com[0].copy())
-        engine.advance(pd_law(kp, kd, default), 100, FREE)
+        engine.advance(pd_law(kp, kd, default), 100, ())
     fall = heights[2] - 2.0 * heights[1] + heights[0]
     np.testing.assert_allclose(fall, [0.0, 0.0, -9.81 * 0.01], atol=2e-3)
 
@@ -89,19 +88,22 @@ def test_joints_settle_where_pd_and_gravity_have_them(engine, model, spec, gains
     qpos = np.concatenate(([0.0, 0.0, 1.6, 1.0, 0.0, 0.0, 0.0], default))
     engine.reset(qpos, np.zeros(25), 1.0)
     engine.hold(True)
-    engine.advance(pd_law(kp, kd, default), 3000, np.array([[0.0, 0.0, -10.0], [0.0, 0.0, 0.0]]))
+    hand, shin = spec.arms[0], spec.chain(spec.feet[1].body, spec.base_body)[-2].name
+    on_hand = PointForce(hand.hand_body, hand.hand_point, np.array([0.0, 0.0, -10.0]))
+    on_knee = PointForce(shin, (0.0, 0.0, 0.0), np.array([8.0, 3.0, 0.0]))
+    engine.advance(pd_law(kp, kd, default), 3000, [on_hand, on_knee])
     np.testing.assert_allclose(engine.qpos[:3], qpos[:3], atol=1e-3)
     data = mujoco.MjData(model)
     data.qpos[:] = engine.qpos
     mujoco.mj_forward(model, data)
-    hand = data.body(spec.arms[0].hand_body)
-    jacobian = np.zeros((3, model.nv))
-    point = hand.xpos + hand.xmat.reshape(3, 3) @ spec.arms[0].hand_point
-    mujoco.mj_jac(model, data, jacobian, None, point, hand.id)
-    static = data.qfrc_bias[6:] - jacobian[:, 6:].T @ [0.0, 0.0, -10.0]
+    static = data.qfrc_bias[6:]
+    for force in (on_hand, on_knee):
+        body, jacobian = data.body(force.body), np.zeros((3, model.nv))
+        mujoco.mj_jac(model, data, jacobian, None, body.xpos + body.xmat.reshape(3, 3) @ force.point, body.id)
+        static = static - jacobian[:, 6:].T @ force.force_w
     np.testing.assert_allclose(kp * (default - engine.qpos[7:]), static, atol=0.15)
     engine.hold(False)
-    engine.advance(damped_law(kd), 300, FREE)
+    engine.advance(damped_law(kd), 300, ())
     assert engine.qpos[2] < 1.5
 
 
@@ -116,7 +118,7 @@ def test_torque_limits_hold(engine, spec, gains):
         one.reset(np.concatenate(([0.0, 0.0, 3.0, 1.0, 0.0, 0.0, 0.0], default)), np.zeros(25), 1.0)
         target = default.copy()
         target[elbow] -= 10.0
-        one.advance(pd_law(kp, 0.0 * kd, target), 5, FREE)
+        one.advance(pd_law(kp, 0.0 * kd, target), 5, ())
         rates.append(one.qvel[6 + elbow])
     low.close()
     assert rates[0] == pytest.approx(10.0 * rates[1], rel=0.25)
@@ -130,7 +132,7 @@ def test_links_that_touch_are_named(engine, spec, gains):
     crossed[spec.indices(["left_hip_roll", "right_hip_roll"])] = -0.27, 0.27  # soles 3 cm beyond each other
     for pose, legs in ((default, set()), (crossed, {"left", "right"})):
         engine.reset(np.concatenate(([0.0, 0.0, 3.0, 1.0, 0.0, 0.0, 0.0], pose)), np.zeros(25), 1.0)
-        engine.advance(pd_law(kp, kd, pose), 1, FREE)
+        engine.advance(pd_law(kp, kd, pose), 1, ())
         touching = engine.touching()
         assert {name.split("_")[0] for pair in touching for name in pair} == legs
         assert all(first < second for first, second in touching)
@@ -142,7 +144,7 @@ def test_pairs_that_never_collide_touch_in_no_engine(any_engine, any_spec):
     pose = np.array([j.default_rad for j in any_spec.joints])
     gains = [np.array([getattr(j, name) for j in any_spec.joints]) for name in ("kp", "kd")]
     any_engine.reset(np.concatenate(([0.0, 0.0, 3.0, 1.0, 0.0, 0.0, 0.0], pose)), np.zeros(6 + len(pose)), 1.0)
-    any_engine.advance(pd_law(*gains, pose), 1, FREE)
+    any_engine.advance(pd_law(*gains, pose), 1, ())
     assert any_engine.touching() == set()
 
 
@@ -152,7 +154,7 @@ def test_heavier_robots_sag_more(engine, spec, gains):
     for scale in (1.0, 1.2):
         engine.reset(np.concatenate(([0.0, 0.0, 1.6, 1.0, 0.0, 0.0, 0.0], default)), np.zeros(25), scale)
         engine.hold(True)
-        engine.advance(pd_law(kp, kd, default), 1500, FREE)
+        engine.advance(pd_law(kp, kd, default), 1500, ())
         sag.append((engine.qpos[7:] - default)[spec.indices(["left_elbow", "right_elbow"])])
     np.testing.assert_allclose(sag[1] / sag[0], 1.2, rtol=0.03)
 

@@ -92,7 +92,9 @@ def test_a_run_is_the_same_tour_whatever_others_there_are_and_another_for_anothe
 def test_no_training_can_have_the_seed_of_a_tour():
     with pytest.raises(ValueError, match="seed"):
         HumanoidEnvConfig(seed=SEED_OFFSET).check()
-    assert Tour(seed=7).punches().seed == SEED_OFFSET + 7
+    for seed in (7, 2**62):  # the largest
+        assert Tour(seed=seed).punches().seed == SEED_OFFSET + seed
+        Tour(seed=seed).check()
 
 
 def started(robot: str, law: str = "pd", **fields) -> tuple[Tour, HumanoidEnv]:
@@ -216,7 +218,8 @@ def test_the_same_seed_gives_the_same_scores(checkpoint):
     ("options", "message"),
     [(["--waypoints", "0"], "waypoints must be a positive integer"), (["--force-size", "-1"], "punches.force_n"),
      (["--episode-seconds", "91.01"], "a multiple of 0.02 s"), (["--episode-seconds", "1.8"], "punches.segment_s"),
-     (["--upper-actions", "x"], "upper_actions")],
+     (["--upper-actions", "x"], "upper_actions"), (["--engine", "physx"], "engine 'physx' is unknown"),
+     (["--engine", "pybullet", "--randomize"], "randomize does nothing in pybullet, got True")],
 )  # fmt: skip
 def test_bad_options_are_named(options, message, capsys):
     assert main(["tour", *options]) == 2
@@ -231,7 +234,13 @@ def test_a_policy_of_another_control_rate_is_refused():
 def whole(robot: str, **settings) -> dict:
     measure = {"mean": 0.5, "std": 0.1, "ci95": [0.4, 0.6], "n": 512}
     names = ("survival_s", "completed_fraction", "position_error", "yaw_error", "energy")
-    given = {"episode_seconds": 90.0, "waypoints": 18, "force_size": 500.0, "env": {"robot": robot}} | settings
+    given = {
+        "episode_seconds": 90.0,
+        "waypoints": 18,
+        "force_size": 500.0,
+        "engine": "mujoco",
+        "env": {"robot": robot},
+    } | settings
     return {"settings": given, "method": "pd", "metrics": dict.fromkeys(names, measure)}
 
 

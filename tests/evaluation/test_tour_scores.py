@@ -61,14 +61,14 @@ def test_a_state_that_is_not_a_number_spoils_no_score():
 def test_the_report_by_hand():
     """Three runs: two completed; energy is of these, errors of all up to their fall."""
     m = TourMeasures(
-        torch.tensor([10.0, 10.0, 7.0]), torch.tensor([True, True, False]),
+        torch.tensor([10.0, 10.0, 7.5]), torch.tensor([True, True, False]),
         torch.tensor([[0.1, 0.3], [0.2, 0.2], [0.6, NAN]]), torch.tensor([[0.0, 0.2], [0.1, 0.1], [0.4, NAN]]),
         torch.tensor([100.0, 300.0, 900.0]), torch.tensor([1.0, 2.0, 9.0]),
     )  # fmt: skip
-    result = m.report(5.0, 0)
+    result = m.report(5.0, 2.5, 0)
     means = {name: value["mean"] for name, value in result["metrics"].items()}
     assert means == pytest.approx({
-        "survival_s": 9.0, "completed_fraction": 2 / 3, "position_error": 1 / 3, "yaw_error": 0.2, "energy": 200.0,
+        "survival_s": 27.5 / 3, "completed_fraction": 2 / 3, "position_error": 1 / 3, "yaw_error": 0.2, "energy": 200.0,
         "vibration": 1.5,
     })  # fmt: skip
     assert result["metrics"]["completed_fraction"]["ci95"] == pytest.approx([0.2077, 0.9385], abs=1e-4)  # Wilson's
@@ -79,6 +79,7 @@ def test_the_report_by_hand():
     )  # fmt: skip
     assert (last["end_s"], last["yaw_error"]["mean"], last["yaw_error"]["n"]) == (10.0, pytest.approx(0.15), 2)
     assert result["window"] == {"start": 0.0, "end": 10.0}
+    assert result["curve"] == {"time": [2.5, 5.0, 7.5, 10.0], "upright": pytest.approx([1.0, 1.0, 2 / 3, 2 / 3])}
     joined = TourMeasures.join([m, m])
     assert joined.energy.tolist() == [100.0, 300.0, 900.0] * 2
     assert joined.position_error.shape == (6, 2)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import torch
 
-from cotap.checks import quoted
+from cotap.checks import quoted, require_one_of
 from cotap.compliance.kinematics import ChainPose
 from cotap.compliance.laws import SENSING_FORCE
 from cotap.configs import from_plain
@@ -22,7 +22,8 @@ from cotap.envs.observations import ObservationHistory, Term, actor_terms, actor
 from cotap.envs.state import RobotState
 from cotap.envs.terminations import TerminationConfig
 from cotap.envs.upper_body import UpperBody, UpperBodyConfig
-from cotap.motions.reference import ReferenceMotion
+from cotap.evaluation.rollout import UPPER_ACTIONS
+from cotap.motions.generator import ArmReference
 from cotap.robots import ROBOTS, RobotSpec
 from cotap.robots.chains import arm_chains
 
@@ -107,6 +108,14 @@ def _config(cls: type[Config], entry: str, plain: dict[str, Any]) -> Config:
     return cfg
 
 
+class ArmMotion(Protocol):
+    """What the arms' reference is to a controller: see `ReferenceMotion`."""
+
+    def current(self) -> ArmReference: ...
+    def step(self, rng: torch.Generator) -> None: ...
+    def reset(self, mask: torch.Tensor, rng: torch.Generator) -> None: ...
+
+
 class Controller:
     """The policy's loop: observation history, gait phase, and the arms' law.
 
@@ -119,11 +128,12 @@ class Controller:
         commands: How commands are drawn and approached.
         motion: The arms' reference.
         seed: Of random commands and random motion.
+        upper_actions: What moves the arms: policy, or reference for the raw reference in place of its upper actions.
     """
 
     def __init__(
         self, policy: OnnxPolicy, spec: RobotSpec, laws: UpperBodyConfig, commands: CommandConfig,
-        motion: ReferenceMotion, seed: int,
+        motion: ArmMotion, seed: int, upper_actions: str = "policy",
     ) -> None:  # fmt: skip
         if laws.torso.model == "support":
             raise ValueError("upper_body.torso.model 'support' needs foot contacts, which the robot does not measure")
@@ -141,6 +151,7 @@ class Controller:
         self._default = torch.tensor([[j.default_rad for j in spec.joints]], dtype=torch.float64)
         self._kp, self._kd = np.array([j.kp for j in spec.joints]), np.array([j.kd for j in spec.joints])
         self._num_lower = len(spec.lower_joints)
+        self._raw_arms = require_one_of("upper_actions", upper_actions, UPPER_ACTIONS) == "reference"
         self._chains, self._shape = arm_chains(spec, torch.float64), (len(spec.arms), len(spec.arms[0].joints))
         self._action = np.zeros(len(spec.joints))
         self.targets = np.array([j.default_rad for j in spec.joints])
@@ -177,6 +188,8 @@ class Controller:
         self._started = True
         targets = self._policy(self._history.append(present, fresh)[0].numpy())
         seen = observed[0].double().numpy()
+        if self._raw_arms:
+            targets[self._num_lower :] = seen
         self._action = self._policy.action(targets, seen)
         self.motion.step(self._rng)
         reference = self.motion.current()

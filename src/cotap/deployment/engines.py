@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -13,6 +13,7 @@ from cotap.checks import require_one_of, require_range
 from cotap.deployment.joint_law import JointLaw
 from cotap.robots import RobotSpec
 from cotap.robots.mjcf import COLLISIONS
+from cotap.robots.spec import Vec3
 
 CONES = ("elliptic", "pyramidal")
 
@@ -46,6 +47,17 @@ class EngineConfig:
             raise ValueError("pybullet has full collision and friction cones of its own; leave collision and cone out")
 
 
+@dataclass(frozen=True)
+class PointForce:
+    """A force on a body."""
+
+    body: str
+    point: Vec3
+    """Where it acts, in the body's frame [m]."""
+    force_w: np.ndarray
+    """(3,) world frame [N]."""
+
+
 class Engine(Protocol):
     """One robot. `qpos` (7 + J,) and `qvel` (6 + J,) are live and laid out as MuJoCo's; `sensor` arrays are live."""
 
@@ -64,13 +76,13 @@ class Engine(Protocol):
         """Hold the base where it is now, or let it go."""
         ...
 
-    def advance(self, law: JointLaw, steps: int, hand_force_w: np.ndarray) -> None:
+    def advance(self, law: JointLaw, steps: int, forces: Sequence[PointForce]) -> None:
         """Take physics steps, with the law evaluated at each and clipped to the torque limits.
 
         Args:
             law: What the motors do.
             steps: How many.
-            hand_force_w: (A, 3) forces at the hand points [N], world frame.
+            forces: What else acts on the robot in all of them.
         """
         ...
 

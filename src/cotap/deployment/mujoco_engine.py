@@ -4,10 +4,12 @@ from __future__ import annotations
 
 # MuJoCo's extension module has no type stubs.
 # pyright: reportAttributeAccessIssue=false
+from collections.abc import Sequence
+
 import mujoco
 import numpy as np
 
-from cotap.deployment.engines import EngineConfig
+from cotap.deployment.engines import EngineConfig, PointForce
 from cotap.deployment.joint_law import JointLaw
 from cotap.robots import RobotSpec
 from cotap.robots.mjcf import build_mjspec, hold_base
@@ -34,10 +36,6 @@ class MujocoEngine:
         self.data = mujoco.MjData(model)
         self.qpos, self.qvel = self.data.qpos, self.data.qvel
         self._mass, self._inertia = model.body_mass.copy(), model.body_inertia.copy()
-        self._hands = [
-            (model.body(arm.hand_body).id, np.array(arm.hand_point) - np.array(spec.body(arm.hand_body).com))
-            for arm in spec.arms
-        ]
 
     def sensor(self, name: str) -> np.ndarray:
         """As `Engine.sensor`."""
@@ -61,12 +59,12 @@ class MujocoEngine:
             self.model.eq_data[equality, 3:10] = np.concatenate((origin, inverse))
         self.data.eq_active[equality] = held
 
-    def advance(self, law: JointLaw, steps: int, hand_force_w: np.ndarray) -> None:
+    def advance(self, law: JointLaw, steps: int, forces: Sequence[PointForce]) -> None:
         """As `Engine.advance`."""
         model, data = self.model, self.data
         damping = np.diag(law.damping)
         model.actuator_biasprm[:, 2] = -damping
-        self._push(hand_force_w)
+        self._push(forces)
         q, dq = data.qpos[7:], data.qvel[6:]
         for _ in range(steps):
             data.ctrl[:] = law.torque(q, dq) + damping * dq
@@ -81,12 +79,12 @@ class MujocoEngine:
     def close(self) -> None:
         """As `Engine.close`."""
 
-    def _push(self, force_w: np.ndarray) -> None:
-        if not force_w.any():
-            self.data.xfrc_applied[:] = 0.0
-            return
-        mujoco.mj_kinematics(self.model, self.data)
-        for (body, lever), force in zip(self._hands, force_w, strict=True):
+    def _push(self, forces: Sequence[PointForce]) -> None:
+        self.data.xfrc_applied[:] = 0.0
+        if forces:
+            mujoco.mj_kinematics(self.model, self.data)
+        for force in forces:
+            body = self.model.body(force.body).id
             # MuJoCo takes a wrench at the centre of mass.
-            lever_w = self.data.xmat[body].reshape(3, 3) @ lever
-            self.data.xfrc_applied[body] = np.concatenate((force, np.cross(lever_w, force)))
+            lever_w = self.data.xmat[body].reshape(3, 3) @ (np.array(force.point) - self.model.body_ipos[body])
+            self.data.xfrc_applied[body] += np.concatenate((force.force_w, np.cross(lever_w, force.force_w)))

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from cotap.compliance.dynamics import GRAVITY_M_S2
-from cotap.deployment.engines import EngineConfig
+from cotap.deployment.engines import EngineConfig, PointForce
 from cotap.deployment.joint_law import JointLaw
 from cotap.deployment.rotors import with_rotors
 from cotap.robots import RobotSpec
@@ -92,7 +93,7 @@ class PybulletEngine:
             )  # fmt: skip
             self._bullet.changeConstraint(self._held, maxForce=1e5)
 
-    def advance(self, law: JointLaw, steps: int, hand_force_w: np.ndarray) -> None:
+    def advance(self, law: JointLaw, steps: int, forces: Sequence[PointForce]) -> None:
         """As `Engine.advance`."""
         q, dq = self.qpos[7:], self.qvel[6:]
         for _ in range(steps):
@@ -100,8 +101,8 @@ class PybulletEngine:
             self._bullet.setJointMotorControlArray(
                 self._robot, self._joints, self._names.TORQUE_CONTROL, forces=torque.tolist()
             )
-            if hand_force_w.any():
-                self._push(hand_force_w)
+            for force in forces:
+                self._push(force)
             self._bullet.stepSimulation()
             self._read_joints()
         self._read_base()
@@ -149,13 +150,12 @@ class PybulletEngine:
                 localInertiaDiagonal=[scale * v for v in body.diaginertia],
             )  # fmt: skip
 
-    def _push(self, force_w: np.ndarray) -> None:
-        for arm, force in zip(self._model.arms, force_w, strict=True):
-            position, attitude = self._link_frame(arm.hand_body)
-            point = position + attitude.apply(arm.hand_point)
-            self._bullet.applyExternalForce(
-                self._robot, self._links[arm.hand_body], force.tolist(), point.tolist(), self._names.WORLD_FRAME
-            )
+    def _push(self, force: PointForce) -> None:
+        position, attitude = self._link_frame(force.body)
+        point = position + attitude.apply(force.point)
+        self._bullet.applyExternalForce(
+            self._robot, self._links[force.body], force.force_w.tolist(), point.tolist(), self._names.WORLD_FRAME
+        )
 
     def _link_frame(self, body: str) -> tuple[np.ndarray, Rotation]:
         """Where a body's own frame is, (3,) [m], and its orientation."""

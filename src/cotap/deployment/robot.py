@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +11,7 @@ import torch
 
 from cotap.checks import require_range
 from cotap.deployment.controller import Readings, measured
-from cotap.deployment.engines import Engine, EngineConfig, EngineState
+from cotap.deployment.engines import Engine, EngineConfig, EngineState, PointForce
 from cotap.deployment.joint_law import JointLaw, pd_law
 from cotap.envs.state import RobotState, StateReader
 from cotap.robots import RobotSpec
@@ -132,20 +133,25 @@ class Robot:
         self._lost = readings
         return readings
 
-    def act(self, law: JointLaw, hand_force_h: np.ndarray, at_once: bool = False) -> None:
+    def act(
+        self, law: JointLaw, hand_force_h: np.ndarray, at_once: bool = False, others: Sequence[PointForce] = ()
+    ) -> None:
         """Let a control step pass.
 
         Args:
             law: For the motors, which it reaches with the robot's delay.
             hand_force_h: (A, 3) forces on the hands, heading frame [N].
             at_once: The law comes from the motor drivers themselves, as in a stop, and is not late.
+            others: Forces elsewhere.
         """
         delay = len(self._queue) - 1
         self._queue = deque([law] * (1 + delay)) if at_once else self._queue
         self._queue.append(law)
         self._queue.popleft()
         heading = self.truth().heading_w[0].numpy()
-        self.engine.advance(self._queue[0], self.steps, hand_force_h @ heading.T)
+        hands = zip(self.spec.arms, hand_force_h @ heading.T, strict=True)
+        forces = [PointForce(arm.hand_body, arm.hand_point, force) for arm, force in hands if force.any()]
+        self.engine.advance(self._queue[0], self.steps, [*forces, *others])
         self._truth = None
 
     def _noise(self, width: float, like: torch.Tensor) -> torch.Tensor:

@@ -47,7 +47,7 @@ class PunchConfig:
         require_range("punches.segment_s", self.segment_s, self.first_s + self.duration_s, 1e6)
         require_positive_int("punches.count", self.count)
         require_range("punches.ramp_s", self.ramp_s, 1e-3, 1e6)
-        require_range("punches.seed", self.seed, 0, 2**63)
+        require_range("punches.seed", self.seed, 0, 2**64)
 
     def ceiling_n(self, time_s: np.ndarray) -> np.ndarray:
         """Largest force [N] of punches that begin at `time_s` (...) [s]."""

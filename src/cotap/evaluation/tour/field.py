@@ -69,7 +69,7 @@ def _own_cells(result: dict[str, Any]) -> list[str]:
     m = result["metrics"]
     scales = {"survival_s": 1.0, "completed_fraction": 100.0, "position_error": 100.0,
               "yaw_error": 180.0 / math.pi, "energy": 1e-3}  # fmt: skip
-    name = f"**this policy, arms {result['method']}**"
+    name = f"**this policy, {result['settings']['engine']}, arms {result['method']}**"
     return [name, *(_interval(m[measure], scale) for measure, scale in scales.items())]
 
 

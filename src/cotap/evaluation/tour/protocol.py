@@ -21,10 +21,11 @@ from cotap.evaluation.protocol import Protocol
 from cotap.evaluation.rollout import UPPER_ACTIONS, PolicyFunction, acting, picture_row
 from cotap.evaluation.tour.arm_walk import INTERVAL_S, ArmWalk, arms_at
 from cotap.evaluation.tour.route import Pilot, draw_waypoints, yaw_of
-from cotap.evaluation.tour.scores import TourMeasures, TourScorer
+from cotap.evaluation.tour.scores import TourScorer
 from cotap.evaluation.tour.stance import TourStance, tour_stance
 from cotap.robots import RobotSpec
 
+ENGINES = ("mujoco", "pybullet")
 SEED_OFFSET = 2**62 + 1
 """What is added to the seed: no other seed of the package may be that large, so that no training sees a tour."""
 _WAYPOINTS, _ARMS = 1, 2  # streams of random numbers; that of punches is 0
@@ -52,9 +53,15 @@ class Tour(Protocol):
     episode_seconds: float = 90.0
     """Time for all of them [s]."""
 
+    engine: str = "mujoco"
+    """mujoco, with all runs at once, or pybullet, one run after the other in the loop of `python -m cotap.deploy`."""
+
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
         super().check()
+        require_one_of("engine", self.engine, ENGINES)
+        if self.engine != "mujoco":
+            self.require_default("randomize", f"in {self.engine}")
         require_one_of("upper_actions", self.upper_actions, UPPER_ACTIONS)
         require_positive_int("waypoints", self.waypoints)
         require_range("episode_seconds", self.episode_seconds, CONTROL_S, 3600.0)
@@ -83,6 +90,12 @@ class Tour(Protocol):
         """The punches of all runs."""
         return PunchConfig(
             self.force_size, segment_s=self.segment_s, count=self.waypoints, seed=SEED_OFFSET + self.seed
+        )
+
+    def scorer(self, num_runs: int, num_joints: int, device: torch.device | str = "cpu") -> TourScorer:
+        """Of runs that begin now."""
+        return TourScorer(
+            num_runs, num_joints, self.waypoints, self.segment_steps, CONTROL_S, self.stance.fallen_height_m, device
         )
 
     def draw(self, spec: RobotSpec, stance: TourStance, runs: range) -> tuple[torch.Tensor, torch.Tensor]:
@@ -118,12 +131,8 @@ class Tour(Protocol):
     def evaluate(self, env: HumanoidEnv, policy: PolicyFunction) -> dict[str, Any]:
         """Run in an environment that is prepared. Returns the measured part of the JSON."""
         obs, act = self._begin(env), acting(env, policy, self.upper_actions)
-        scorer = TourScorer(
-            env.num_envs, env.num_actions, self.waypoints, self.segment_steps, env.dt, self.stance.fallen_height_m,
-            env.device,
-        )  # fmt: skip
+        scorer = self.scorer(env.num_envs, env.num_actions, env.device)
         film: list[torch.Tensor] = []
-        upright: list[float] = []
         steps = range(self.waypoints * self.segment_steps)
         for step in tqdm(steps, desc="tour", unit="step", disable=None, leave=False):
             self._ask(env, *self.pilot.command(step * env.dt, *_pelvis(env), env.state.heading_w))
@@ -132,12 +141,11 @@ class Tour(Protocol):
             way, turn = self.pilot.error(step // self.segment_steps, *_pelvis(env))
             r = env.record
             scorer.step(env.sim.qpos[:, 2].float(), r.state.joint_vel, r.torque, way, turn, extras["falls"])
-            upright.append(float(scorer.standing.float().mean()))
             film.append(picture_row(env))
             if not scorer.standing.any():
                 break
         self.film = torch.stack(film).cpu()
-        return self.report(scorer.measures(), upright, env.dt)
+        return scorer.measures().report(self.segment_s, env.dt, self.seed)
 
     def _begin(self, env: HumanoidEnv) -> TensorDict:
         """Let all robots go, asked for nothing yet; return the observations."""
@@ -153,11 +161,6 @@ class Tour(Protocol):
     def _ask(env: HumanoidEnv, velocity: torch.Tensor, yaw_rate: torch.Tensor, stand: torch.Tensor) -> None:
         """Command velocities at nominal height."""
         env.commands.override(velocity, yaw_rate, stand, torch.full_like(yaw_rate, env.spec.nominal_height_m))
-
-    def report(self, measures: TourMeasures, upright: list[float], dt: float) -> dict[str, Any]:
-        """The measured part of the JSON, of the share of runs `upright` at every control step too."""
-        curve = {"time": [dt * (k + 1) for k in range(len(upright))], "upright": upright}
-        return measures.report(self.segment_s, self.seed) | {"curve": curve}
 
     def table(self, result: dict[str, Any]) -> str:
         """The result as Markdown; a whole tour of the G1 beside the published figures."""

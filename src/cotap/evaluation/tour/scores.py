@@ -34,8 +34,11 @@ class TourMeasures:
         names = TourMeasures.__dataclass_fields__
         return TourMeasures(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names})
 
-    def report(self, segment_s: float, seed: int) -> dict[str, Any]:
+    def report(self, segment_s: float, dt: float, seed: int) -> dict[str, Any]:
         """The measured part of the evaluation's JSON. Energy and vibration are of runs that were completed."""
+        steps = round(segment_s * self.position_error.shape[1] / dt)
+        time = dt * torch.arange(1, steps + 1)
+        upright = (self.survival_s > time.unsqueeze(1) + 0.5 * dt) | self.completed
         nothing = torch.full_like(self.survival_s, math.nan)
         measures = {
             "survival_s": self.survival_s,
@@ -56,6 +59,7 @@ class TourMeasures:
             "metrics_without_falls": summaries(measures, self.completed, seed),
             "window": {"start": 0.0, "end": segment_s * len(ends)},
             "segments": ends,
+            "curve": {"time": time.tolist(), "upright": upright.float().mean(1).tolist()},
         }
 
 
@@ -79,7 +83,7 @@ class TourScorer:
         self._segment_steps, self._dt, self._fallen_m = segment_steps, dt, fallen_height_m
         self.standing = torch.ones(num_runs, dtype=torch.bool, device=device)
         """(N,) who has not fallen."""
-        self._seconds, self._energy, self._vibration = (torch.zeros(num_runs, device=device) for _ in range(3))
+        self._survived, self._energy, self._vibration = (torch.zeros(num_runs, device=device) for _ in range(3))
         self._rate, self._acceleration = torch.zeros(2, num_runs, num_joints, device=device)
         self._position_error, self._yaw_error = torch.full((2, num_runs, segments), math.nan, device=device)
         self._steps = 0
@@ -98,7 +102,7 @@ class TourScorer:
             turn: (N,) yaw error [rad].
             broken: (N,) bool: the simulation has diverged; that is a fall.
         """
-        self._seconds = self._seconds + self._dt * self.standing
+        self._survived = self._survived + self.standing  # steps
         self.standing = self.standing & (height >= self._fallen_m) & ~broken
         acceleration = (rate - self._rate) / self._dt
         work = self._dt * (torque * rate).abs().sum(1)
@@ -115,9 +119,8 @@ class TourScorer:
 
     def measures(self) -> TourMeasures:
         """Of all steps so far, on the processor."""
-        values = (
-            self._seconds, self.standing, self._position_error, self._yaw_error, self._energy, self._vibration,
-        )  # fmt: skip
+        errors = self._position_error, self._yaw_error
+        values = (self._dt * self._survived, self.standing, *errors, self._energy, self._vibration)
         return TourMeasures(*(value.cpu() for value in values))
 
 
