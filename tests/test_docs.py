@@ -35,6 +35,16 @@ def test_the_law_of_ones_own_runs_and_is_the_one_shown(monkeypatch):
     assert example.read_text().split('"""\n\n', 1)[1] in (DOCS / "laws.md").read_text()
 
 
+def test_the_passive_arm_gives_away_no_more_than_its_store_had():
+    example = DOCS / "examples" / "passive_arm.py"
+    text = example.read_text()
+    assert text.count("\n") < 60
+    assert set(re.findall(r"^(?:import|from) (\S+)", text, re.M)) == {"torch", "cotap.compliance.passivity"}
+    run = runpy.run_path(str(example))["run"]
+    assert run(filtered=False, steps=600) > 3.0
+    assert 0.5 < run(filtered=True, steps=600) < 1.01  # its first filling is 1 J; the rest is integration
+
+
 def test_modules_import_what_the_table_of_the_architecture_lets_them():
     rows = re.findall(r"^\| ([\w, ]+) \| ([^|]+) \|$", (DOCS / "architecture.md").read_text(), re.M)
     table = {name.strip(): set(re.findall(r"\w+", may)) for names, may in rows for name in names.split(",")}

@@ -7,21 +7,28 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from cotap.compliance.arm_kinematics import ArmKinematics
+    from cotap.compliance.passivity import EnergyStore, damping_energy, hold_back, rate_margin, stiffness_energy
     from cotap.compliance.spd import log_euclidean_mean, modulate_stiffness, spd_exp, spd_log
     from cotap.compliance.stiffness import condition_number, resolve_joint_stiffness, singularity_aware_ratio
 
 __all__ = [
     "ArmKinematics",
+    "EnergyStore",
     "condition_number",
+    "damping_energy",
+    "hold_back",
     "log_euclidean_mean",
     "modulate_stiffness",
+    "rate_margin",
     "resolve_joint_stiffness",
     "singularity_aware_ratio",
     "spd_exp",
     "spd_log",
+    "stiffness_energy",
 ]
 _MODULES = {
     "arm_kinematics": ("ArmKinematics",),
+    "passivity": ("EnergyStore", "damping_energy", "hold_back", "rate_margin", "stiffness_energy"),
     "spd": ("log_euclidean_mean", "modulate_stiffness", "spd_exp", "spd_log"),
     "stiffness": ("condition_number", "resolve_joint_stiffness", "singularity_aware_ratio"),
 }

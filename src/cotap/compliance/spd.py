@@ -86,7 +86,8 @@ def _last_log_derivative(values: torch.Tensor, vectors: torch.Tensor, direction:
 
 # Were the compiler to look inside, second derivatives would be zero. To tell it so loads it, about a second of import.
 @torch.compiler.allow_in_graph
-def _apply_log(matrix: torch.Tensor, values: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
+def log_from_eigenvectors(matrix: torch.Tensor, values: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
+    """Logarithm (..., n, n) of `matrix`, whose eigenvalues (..., n) and eigenvectors (..., n, n) are known."""
     return cast(torch.Tensor, _SpdLog.apply(matrix, values, vectors))
 
 
@@ -96,7 +97,7 @@ def _log(name: str, matrix: torch.Tensor) -> torch.Tensor:
     whole = symmetric_part(matrix.double())
     values, vectors = torch.linalg.eigh(whole.detach())
     require_positive_definite(name, values, matrix.dtype)
-    return _apply_log(whole, values, vectors)
+    return log_from_eigenvectors(whole, values, vectors)
 
 
 def _exp(matrix: torch.Tensor) -> torch.Tensor:
