@@ -151,11 +151,11 @@ class EnvStepping:
 class Compliance:
     """Both arms of every env, from joint angles to torque: kinematics, stiffness, blend, gravity, two torques."""
 
-    def __init__(self, num_envs: int, seconds: float, law: str = "cotap") -> None:
+    def __init__(self, num_envs: int, seconds: float, law: str = "cotap", passive: bool = False) -> None:
         self.seconds, self.num_envs, spec = seconds, num_envs, h1()
         self.arms = arm_model(spec)
         self.chains = self.arms.chains
-        self.law = LAWS[law](self.arms, LawConfig(law))
+        self.law = LAWS[law](self.arms, LawConfig(law, passive=passive))
         self.force = torch.tensor([10.0, 0.0, -20.0]).repeat(num_envs, 2, 1)
         self.fresh = torch.zeros(num_envs, dtype=torch.bool)
         joints = [spec.joints[i] for i in spec.indices(spec.upper_joints)]
@@ -395,6 +395,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     parts["compliance"] = Compliance(num_envs, seconds).run
     for law in LAWS:
         parts[f"law_{law}"] = Compliance(num_envs, seconds, law).run
+    parts["passive"] = Compliance(num_envs, seconds, passive=True).run
     parts["inverse_kinematics"] = InverseKinematics(num_envs, seconds).run
     parts["compliance_literal"] = LiteralCompliance(num_envs, seconds).run
     parts["mujoco_rollout"] = lambda: rollout_rate(recording, seconds)
@@ -426,6 +427,13 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
         ),
         "compliance_ms": 1e3 * num_envs / median["compliance"],
         "compliance_over_physics": ratio(results, "physics", to="compliance"),
+        "passivity_ms": 1e3 * num_envs * (1.0 / median["passive"] - 1.0 / median["compliance"]),
+        "passivity_over_physics": statistics.median(
+            physics / passive - physics / plain
+            for physics, passive, plain in zip(
+                results["physics"], results["passive"], results["compliance"], strict=True
+            )
+        ),
         "compliance_literal_ms": 1e3 * num_envs / median["compliance_literal"],
         "compliance_literal_over_compliance": ratio(results, "compliance", to="compliance_literal"),
         "inverse_kinematics_ms": 1e3 * num_envs / median["inverse_kinematics"],
@@ -456,6 +464,10 @@ def table(result: dict[str, Any]) -> str:
         f"compliance of both arms: {result['compliance_ms']:.1f} ms, {result['compliance_over_physics']:.3f} of a "
         f"physics step; the literal pipeline takes {result['compliance_literal_over_compliance']:.1f} times as long"
     )
+    passivity = (
+        f"energy store of both arms: {result['passivity_ms']:.1f} ms on top, {result['passivity_over_physics']:.3f} of "
+        "a physics step"
+    )
     ik = (
         f"inverse kinematics of both arms: {result['inverse_kinematics_ms']:.1f} ms, "
         f"{result['inverse_kinematics_over_physics']:.3f} of a physics step"
@@ -466,7 +478,15 @@ def table(result: dict[str, Any]) -> str:
     laws = ["", "| law of the arms, per control step | ms | over physics |", "|---|---|---|", *laws, ""]
     clips = f"10,000 clips beside generated arm motion cost {result['clips_over_env']:.2%} of an environment step"
     return "\n".join(
-        [*lines, *laws, compliance, ik, clips, f"\npeak memory of training: {result['peak_rss_mib']:,.0f} MiB"]
+        [
+            *lines,
+            *laws,
+            compliance,
+            passivity,
+            ik,
+            clips,
+            f"\npeak memory of training: {result['peak_rss_mib']:,.0f} MiB",
+        ]
     )
 
 

@@ -16,7 +16,7 @@ from cotap.deployment.engines import EngineConfig
 from cotap.deployment.robot import Perturbations
 from cotap.deployment.safety import SafetyConfig
 from cotap.deployment.scenario import Scenario, TimedCommand, load_scenario
-from cotap.evaluation.law_options import parse_law
+from cotap.evaluation.law_options import make_passive, parse_law
 from cotap.files import require_output
 
 
@@ -45,6 +45,9 @@ class DeployOptions:
     """The left arm's law, such as cotap:alpha=0.7,stiffness=500; by default the scenario's, or that of training."""
     right: str = ""
     """The right arm's law."""
+    passive: bool = False
+    """Hold back changes of stiffness that would give away more energy than a store has, on arms under cotap. Not given,
+    it is as in the training, or as --left and --right say."""
     seed: int = 0
     """Seed of commands, motions and perturbations."""
     json: str = ""
@@ -105,6 +108,8 @@ def deploy(options: DeployOptions) -> dict[str, Any]:
         text = getattr(options, side) or getattr(scenario, side)
         if text:
             setattr(laws, side, parse_law(side, text, replace(laws.of(side))))
+    if options.passive:
+        make_passive(laws)
     laws.check()
     pilot = KeyboardPilot(spec.nominal_height_m) if options.keyboard else None
     if pilot:

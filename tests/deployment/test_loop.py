@@ -333,6 +333,19 @@ def test_a_scenario_is_read_and_run(policy_file, tmp_path, spec, capsys):
     assert [t["touched_s"] for t in result["trials"]] == [{}, {}]
 
 
+def test_the_level_of_the_stores_is_reported(policy_file, tmp_path):
+    out = tmp_path / "r.json"
+    args = ["--policy", str(policy_file), "--left", "cotap:store_energy=0.5", "--right", "pd", "--passive",
+            "--episode-seconds", "0.4", "--json", str(out), "--timestep", "0.01", "--collision", "feet"]  # fmt: skip
+    assert deploy(args) == 0
+    result = json.loads(out.read_text())
+    (trial,) = result["trials"]
+    assert 0.0 < trial["lowest_store_energy"] <= 0.5
+    assert 0.0 <= trial["held_back"] <= 1.0
+    laws = result["settings"]["laws"]
+    assert (laws["left"]["passive"], laws["right"]["passive"]) == (True, False)
+
+
 @pytest.mark.parametrize("engine", ["mujoco", "pybullet"])
 def test_every_robot_is_deployed(robot, engine, random_policy, tmp_path):
     if engine == "pybullet":
@@ -394,6 +407,7 @@ def test_bad_scenarios_are_named(text, message, policy_file, tmp_path, capsys):
         (["--engine", "isaac"], "engine 'isaac' is unknown"),
         (["--library", "own.npz"], "--library 'own.npz' does nothing without --arm-motion, which names a clip"),
         (["--arm-motion", "walk", "--library", "none.npz"], "'none.npz' does not exist"),
+        (["--left", "pd", "--right", "pd", "--passive"], "--passive is not read by pd"),
     ],
 )
 def test_bad_options_are_named(arguments, message, policy_file, capsys):

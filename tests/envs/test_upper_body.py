@@ -332,3 +332,28 @@ def test_an_infeasible_stiffness_is_counted_in_the_log(make_env):
 def test_bad_fields_are_named(make_env, cfg, message):
     with pytest.raises(ValueError, match=message):
         make_env(1, upper_body=cfg)
+
+
+def test_a_store_is_an_arms_own_logged_and_saved(make_env):
+    """Of the passive arms alone; the other arm's law has none."""
+    laws = UpperBodyConfig(LawConfig("cotap", passive=True, store_energy=0.05), LawConfig("cotap"))
+    env, other = (make_env(3, upper_body=laws, seed=seed) for seed in (0, 1))
+    env.upper_body.parameters.stiffness[0, 0] = 1200.0
+    drive(env, 3)
+    env.upper_body.parameters.stiffness[0, 0] = 100.0
+    drive(env, 20, scale=2.0)
+    env.upper_body.parameters.stiffness[0, 0] = 1200.0
+    drive(env, 3, scale=2.0)
+    report = env.upper_body.report
+    assert report["store_energy"][:, 1].isnan().all()
+    assert report["store_energy"][:, 0].isfinite().all()
+    assert float(report["held_back"][0, 0]) > 0.0
+    assert float(env.upper_body.log["/law/store_energy"]) == pytest.approx(float(report["store_energy"][:, 0].mean()))
+    assert float(env.upper_body.log["/law/held_back"]) == pytest.approx(float(report["held_back"][:, 0].mean()))
+    other.load_state_dict(copy.deepcopy(env.state_dict()))
+    futures = [torch.stack(drive(e, 20, seed=5)) for e in (env, other)]
+    assert torch.equal(*futures)
+    levels = [e.upper_body.report["store_energy"][:, 0] for e in (env, other)]
+    assert torch.equal(*levels)
+    env.set_law(0, 0, LawConfig("cotap"))
+    assert env.upper_body.report == {}

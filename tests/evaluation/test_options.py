@@ -129,7 +129,8 @@ def test_a_law_reads_what_it_is_said_to_read(name, spec, rng):
     changes = {"stiffness": (100.0, 200.0, 900.0), "null_stiffness": 90.0, "alpha": 0.2, "condition_threshold": 1.0,
                "error": "task", "damping": "pd", "soft_gain": 60.0, "virtual_mass": 3.0, "damping_ratio": 0.3,
                "reference_share": 0.2}  # fmt: skip
-    assert {*changes, "sensing", "name"} == {f.name for f in fields(LawConfig)}
+    of_a_store = {"passive", "store_energy", "store_power"}  # seen once stiffness changes: tests/compliance
+    assert {*changes, *of_a_store, "sensing", "name"} == {f.name for f in fields(LawConfig)}
     for field, value in changes.items():
         assert torch.equal(torque(), torque(**{field: value})) != reads(name, field), field
     assert READS.keys() == LAWS.keys()
@@ -146,6 +147,9 @@ def test_a_law_reads_what_it_is_said_to_read(name, spec, rng):
         (["impact", "--left", "pd", "--right", "facet", "--error", "task"], "--error is not read by facet and pd"),
         (["impact", "--method", "cotap", "--left", "pd", "--right", "hmc"], "--method does nothing beside"),
         (["impact", "--left", "cotap:alpha=0.5", "--alpha", "1"], "--alpha does nothing: --left and --right"),
+        (["impact", "--passive"], "--passive is not read by pd, the law here; laws that read it: cotap"),
+        (["impact", "--method", "cotap+facet", "--passive"], "--passive is not read by cotap+facet"),
+        (["impact", "--left", "cotap:passive=yes"], "--left: passive 'yes' is unknown; known: false, true"),
         (["impact", "--left", "facet:alpha=0.5"], "--left: facet does not read alpha; it reads: stiffness, "),
         (["impact", "--right", "pd:stiffness=3"], "--right: pd does not read stiffness; it reads: nothing"),
         (["fidelity", "--stiffness", "500"], "--stiffness does nothing here: the protocol sets it, see --stiffness-v"),
@@ -192,3 +196,21 @@ def test_the_law_of_the_training_is_the_default_of_every_evaluation(protocol, di
     named = {"fidelity": ("cotap", "cotap"), "modulation": ("cotap", "cotap"), "periodic-load": ("cotap", "pd")}
     assert (own.left.name, own.right.name) == named.get(protocol, ("pd", "pd"))
     assert arms_of(parse(["periodic-load", "--method", "cotap"]), load_policy(checkpoint)).left == LawConfig("cotap")
+
+
+def test_a_store_is_for_the_arms_whose_law_can_have_one(distilled):
+    policy = load_policy(distilled)
+    for arguments, passive in (
+        ([], (False, False)),
+        (["--passive"], (True, True)),
+        (["--passive", "--right", "pd"], (True, False)),
+        (["--left", "cotap:passive=true,store_energy=0.5"], (True, False)),
+        (["--passive", "--left", "cotap:passive=false"], (False, True)),
+    ):
+        arms = arms_of(parse(["impact", *arguments]), policy)
+        assert (arms.left.passive, arms.right.passive) == passive, arguments
+    trained = UpperBodyConfig(LawConfig("cotap", passive=True), LawConfig("cotap", passive=True))
+    assert LawOptions().configure(trained).left.passive  # as in the training
+    assert not LawOptions(method="pd").configure(trained).left.passive
+    with pytest.raises(ValueError, match=r"upper_body\.left\.passive: pd has no energy store"):
+        UpperBodyConfig(LawConfig("pd", passive=True)).check()

@@ -241,7 +241,7 @@ def test_the_plot_of_force_over_displacement_takes_loaded_steps_along_the_force(
     force, along = force_displacement([sample, loaded], 0, 0)
     assert force.tolist() == [20.0]
     assert along == pytest.approx([50.0], rel=1e-4)
-    assert len(Plots.TITLES) == 5
+    assert len(Plots.TITLES) == 7
 
 
 def test_of_a_taken_port_the_error_says_what_to_do(free_port, capsys):

@@ -157,3 +157,17 @@ def test_a_robot_with_other_arms_has_all_laws(tmp_path):
     sample = run(session, 3)[-1]
     assert sample["arm_torque"].shape == (2, 14)
     assert sample["qpos"].shape == (2, 7 + len(session.env.spec.joints))
+
+
+def test_an_arm_is_made_passive_and_its_store_is_shown(session):
+    assert session.set({"a.left.passive": True, "b.left.passive": True, "b.left.law": "pd"}) == []
+    assert session.env.upper_body.report == {}
+    sample = run(session, 3)[-1]
+    assert np.isfinite(sample["store_energy"]).tolist() == [[True, False], [False, False]]
+    assert sample["store_energy"][0, LEFT] == pytest.approx(2.0)
+    assert sample["held_back"][0, LEFT] == 0.0
+    assert session.without_effect("b.left.passive") == "passive (energy store) does nothing under pd"
+    session.set({"a.left.law": "pd"})
+    assert np.isnan(run(session, 1)[-1]["store_energy"]).all()
+    assert session.set({"b.left.law": "cotap"}) == []
+    assert np.isfinite(run(session, 1)[-1]["store_energy"][1, LEFT])

@@ -53,6 +53,13 @@ class LawConfig:
     reference_share: float = 0.5
     """Share of the compliance that the moving reference provides; the arm does the rest (cotap+facet-matched)."""
 
+    passive: bool = False
+    """Hold back changes of stiffness that would give away more energy than a store has (cotap)."""
+    store_energy: float = 2.0
+    """What that store holds at most, and at first [J]."""
+    store_power: float = 10.0
+    """Most that changes of stiffness may inject per time [W]."""
+
     def check(self, where: str = "law") -> None:
         """Raise ValueError naming the first field, under `where`, that is out of its range."""
         require_one_of(f"{where}.name", self.name, LAWS.keys())
@@ -68,6 +75,10 @@ class LawConfig:
         require_range(f"{where}.virtual_mass", self.virtual_mass, 0.01, 1e3)
         require_range(f"{where}.damping_ratio", self.damping_ratio, 0.01, 100.0)
         require_range(f"{where}.reference_share", self.reference_share, 0.01, 0.99)
+        require_range(f"{where}.store_energy", self.store_energy, 0.0, 1e6)
+        require_range(f"{where}.store_power", self.store_power, 0.0, 1e6)
+        if self.passive and not reads(self.name, "passive"):
+            raise ValueError(f"{where}.passive: {self.name} has no energy store; laws that can have one: cotap")
 
     def kind(self) -> tuple[object, ...]:
         """All that is not a parameter of envs: arms that agree in it are driven by one law."""
@@ -122,11 +133,12 @@ class CoTaPLaw:
         error = state.target - state.position
         if self._cfg.error == "task":
             error = self._task_error(state, blend, error)
+        stiffness, error, held = self._in_force(state, blend.stiffness, error)
         up_t = state.to_heading[:, 2]
-        elastic = (blend.stiffness * error.unsqueeze(-2)).sum(-1)
+        elastic = (stiffness * error.unsqueeze(-2)).sum(-1)
         feedforward = gravity_torque(self._arms.inertias, state.pose, up_t)
         if self._cfg.damping == "critical":
-            damping = critical_damping(blend.stiffness, joint_inertia(self._arms.inertias, state.pose))
+            damping = critical_damping(stiffness, joint_inertia(self._arms.inertias, state.pose))
             if state.target_velocity is not None:
                 feedforward = feedforward + (damping * state.target_velocity.unsqueeze(-2)).sum(-1)
         else:
@@ -135,7 +147,14 @@ class CoTaPLaw:
             "alpha": blend.ratio, "projected": projected.float(), "smallest_eigenvalue": blend.eigenvalue_range[..., 0],
             "largest_eigenvalue": blend.eigenvalue_range[..., 1],
         }  # fmt: skip
-        return TorqueLaw(state.position, feedforward, elastic, blend.stiffness, damping), LawReport(report)
+        return TorqueLaw(state.position, feedforward, elastic, stiffness, damping), LawReport(report | held)
+
+    def _in_force(
+        self, state: ArmState, stiffness: torch.Tensor, error: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
+        """What of the stiffness asked for, and of the error, is put in force; and what to report of that."""
+        del state
+        return stiffness, error, {}
 
     def _task_error(self, state: ArmState, blend: ArmStiffness, joint_error: torch.Tensor) -> torch.Tensor:
         """`J# (x_target - x) + N (q_target - q)`; back to the joint error where the blend goes back to PD."""
@@ -161,6 +180,15 @@ def _arm_stiffness(
     return 0.5 * (inverse + inverse.transpose(-1, -2)), projected
 
 
+def _cotap(arms: Arms, cfg: LawConfig) -> UpperBodyLaw:
+    """With an energy store, or without."""
+    if not cfg.passive:
+        return CoTaPLaw(arms, cfg)
+    from cotap.compliance.passive_law import PassiveCoTaPLaw  # brings torch's compiler, which takes a second
+
+    return PassiveCoTaPLaw(arms, cfg)
+
+
 def _facet(
     arms: Arms, cfg: LawConfig, tracking: UpperBodyLaw, model_scale: float = 1.0, tracking_scale: float = 1.0
 ) -> AdmittanceLaw:
@@ -177,7 +205,7 @@ def _matched(arms: Arms, cfg: LawConfig) -> AdmittanceLaw:
 LAWS: dict[str, Callable[[Arms, LawConfig], UpperBodyLaw]] = {
     "pd": lambda arms, _: PDLaw(arms),
     "soft-pd": lambda arms, cfg: PDLaw(arms, cfg.soft_gain),
-    "cotap": CoTaPLaw,
+    "cotap": _cotap,
     "facet": lambda arms, cfg: _facet(arms, cfg, PDLaw(arms)),
     "cotap+facet": lambda arms, cfg: _facet(arms, cfg, CoTaPLaw(arms, cfg)),
     "cotap+facet-matched": _matched,
@@ -191,7 +219,7 @@ _OF_A_MASS = ("virtual_mass", "damping_ratio")
 READS: dict[str, tuple[str, ...]] = {
     "pd": (),
     "soft-pd": ("soft_gain",),
-    "cotap": _OF_COTAP,
+    "cotap": (*_OF_COTAP, "passive", "store_energy", "store_power"),
     "facet": ("stiffness", *_OF_A_MASS, "sensing"),
     "cotap+facet": (*_OF_COTAP, *_OF_A_MASS, "sensing"),
     "cotap+facet-matched": (*_OF_COTAP, *_OF_A_MASS, "sensing", "reference_share"),

@@ -36,6 +36,8 @@ class Trial:
     stopped: str = ""
     """Why the robot stopped itself; empty if it did not."""
     stopped_at_s: float | None = None
+    stores: list[tuple[torch.Tensor, torch.Tensor]] = field(default_factory=list)
+    """(T) of level [J] and share held back, (1, A) each, where arms have an energy store."""
     touched_s: dict[str, float] = field(default_factory=dict)
     """For how long pairs of the robot's own links touched each other before it fell [s]: tripping over itself."""
     fell: bool = False
@@ -89,6 +91,8 @@ def run_trial(
                 law = law if trial.stopped else asked
             if trial.stopped:
                 trial.stopped_at_s = k * dt
+            elif "store_energy" in (report := controller.upper_body.report):
+                trial.stores.append((report["store_energy"], report["held_back"]))
         push = sum(
             (f.at(torch.tensor([k * dt]))[0, :-1].double().numpy() for f in forces), np.zeros((len(robot.spec.arms), 3))
         )

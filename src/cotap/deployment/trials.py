@@ -81,10 +81,19 @@ def report(
         "metrics": {name: summarize(value, seed) for name, value in measures.items()},
         "trials": [
             {"seconds": len(t.rows) * t.dt, "fell": t.fell, "stopped": t.stopped, "stopped_at_s": t.stopped_at_s,
-             "touched_s": t.touched_s}
+             "touched_s": t.touched_s} | _stores(t)
             for t in trials
         ],
     }  # fmt: skip
+
+
+def _stores(trial: Trial) -> dict[str, float]:
+    """Lowest level of the arms' energy stores [J], and the mean share of a change of stiffness that was held back."""
+    if not trial.stores:
+        return {}
+    level, held_back = (torch.stack(column) for column in zip(*trial.stores, strict=True))
+    lowest = level[level.isfinite()].min()  # NaN for an arm whose law has none
+    return {"lowest_store_energy": float(lowest), "held_back": float(held_back.nanmean())}
 
 
 def _kind(reason: str) -> str:

@@ -132,6 +132,8 @@ class UpperBody(Stateful):
         self._torso = _TorsoModel(cfg.torso, spec, dtype)
         self.log: dict[str, torch.Tensor] = {}
         """Means over envs and arms of what the laws report about the last step."""
+        self.report: dict[str, torch.Tensor] = {}
+        """The same of every arm (N, A); NaN where its law reports nothing of that name."""
 
     def set_law(self, env: int, arm: int, law: LawConfig) -> None:
         """Put one arm of one env under another law, or other parameters, from the next command on.
@@ -149,6 +151,7 @@ class UpperBody(Stateful):
         for _, _, mine in self._laws.values():
             mine[env, arm] = False
         under_it[env, arm] = True
+        self.report = {}
         self._laws = {kind: driven for kind, driven in self._laws.items() if driven[2].any()}
         self.sensors.estimates = any(config.sensing == "estimated" for _, config, _ in self._laws.values())
         self.fresh[env] = True
@@ -201,7 +204,8 @@ class UpperBody(Stateful):
         arms = ArmState(
             q, dq, wanted, state.arms, to_heading, base, target_velocity=rate, fresh=self.fresh, dt=self._dt
         )
-        new, self.log = self._ask(arms)
+        new, self.report = self._ask(arms)
+        self.log = {f"/law/{name}": values.nanmean() for name, values in self.report.items()}
         tensors = (new.anchor, new.feedforward, new.elastic, new.stiffness, new.damping)
         for name, value in zip(self.PAIRED, tensors, strict=True):
             held: torch.Tensor = getattr(self, name)
@@ -298,16 +302,17 @@ class UpperBody(Stateful):
         return self._laws[kind][2]
 
     def _ask(self, arms: ArmState) -> tuple[TorqueLaw, dict[str, torch.Tensor]]:
-        """Every law for all arms; each arm keeps its own's answer."""
+        """Every law for all arms; each arm keeps its own's answer and report."""
         merged: TorqueLaw | None = None
-        log: dict[str, torch.Tensor] = {}
+        reports: dict[str, torch.Tensor] = {}
         for law, config, mine in self._laws.values():
             force = self.sensors.estimated if config.sensing == "estimated" else self.sensors.privileged
             answer, report = law(replace(arms, hand_force_h=force), self.parameters)
-            log.update({f"/law/{k}": v[mine].mean() for k, v in report.values.items()})
+            for name, values in report.values.items():
+                reports[name] = torch.where(mine, values, reports.get(name, torch.nan))
             merged = answer if merged is None else _choose(mine, answer, merged)
         assert merged is not None
-        return merged, log
+        return merged, reports
 
 
 def _choose(mine: torch.Tensor, answer: TorqueLaw, other: TorqueLaw) -> TorqueLaw:

@@ -40,6 +40,9 @@ class LawOptions:
     """Force on the hand: privileged or estimated, from arm torques (facet, dcc)."""
     reference_share: float | None = None
     """Share of the compliance that the moving reference provides (cotap+facet-matched)."""
+    passive: bool = False
+    """Hold back changes of stiffness that would give away more energy than a store has (cotap). Not given, it is as
+    in the training."""
     torso_compliance: str | None = None
     """What is put down to the torso: none, constant or support."""
     left: str = ""
@@ -68,7 +71,7 @@ class LawOptions:
 
     def given(self) -> list[str]:
         """Names of the options that were given, `left` and `right` aside."""
-        return [f.name for f in fields(self) if f.name not in SIDES and getattr(self, f.name) is not None]
+        return [f.name for f in fields(self) if f.name not in SIDES and getattr(self, f.name) != f.default]
 
     def require_free(self, driven: Mapping[str, str]) -> None:
         """Raise ValueError if a field of laws is given that a protocol sets itself, by the option in `driven`."""
@@ -95,11 +98,11 @@ class LawOptions:
 
     def _law(self, side: str, trained: LawConfig) -> LawConfig:
         name, text = self.method or trained.name, getattr(self, side)
-        given = {f.name: value for f in fields(LawConfig) if (value := getattr(self, f.name, None)) is not None}
+        given = {f.name: getattr(self, f.name) for f in fields(LawConfig) if f.name in self.given()}
         if self.stiffness is not None:
             given["stiffness"] = _three(self.stiffness)
         law = replace(trained if name == trained.name else LawConfig(name), **given)
-        return parse_law(side, text, law) if text else law
+        return parse_law(side, text, law) if text else _without_unread_store(law)
 
 
 def parse_law(option: str, text: str, common: LawConfig) -> LawConfig:
@@ -122,12 +125,29 @@ def parse_law(option: str, text: str, common: LawConfig) -> LawConfig:
         if known[key] == "str":
             law = replace(law, **{key: value})
             continue
+        if known[key] == "bool":
+            law = replace(law, **{key: require_one_of(f"--{option}: {key}", value, ("true", "false")) == "true"})
+            continue
         try:
             numbers = tuple(float(v) for v in value.split("x"))
         except ValueError as error:
             raise ValueError(f"--{option}: {key} must be a number, got {quoted(value)}") from error
         law = replace(law, **{key: _three(numbers) if key == "stiffness" else _one(option, key, numbers)})
-    return law
+    return _without_unread_store(law)
+
+
+def make_passive(arms: UpperBodyConfig) -> None:
+    """Give an energy store to every arm whose law can have one. Raises ValueError if none can."""
+    able = [law for law in (arms.left, arms.right) if reads(law.name, "passive")]
+    if not able:
+        raise ValueError(f"--passive is not read by {' and '.join({arms.left.name, arms.right.name})}, the law here")
+    for law in able:
+        law.passive = True
+
+
+def _without_unread_store(law: LawConfig) -> LawConfig:
+    """`law` without the energy store that it was to have in common with another arm's, if it can have none."""
+    return law if reads(law.name, "passive") else replace(law, passive=False)
 
 
 def _flag(name: str) -> str:

@@ -18,12 +18,15 @@ from cotap.evaluation.rollout import STEPPED, Trajectory
 from cotap.files import write_arrays
 from cotap.inputs import InputError, read_arrays
 
-FORMAT, VERSION = "cotap-recording", 2
+FORMAT, VERSION = "cotap-recording", 3
 SCENE: dict[str, tuple[str | int, ...]] = {
     "qpos": ("Q",), "hand_w": ("H", 3), "hand_reference_w": ("H", 3), "hand_force_w": ("H", 3), "heading_w": (3, 3),
     "commanded_stiffness": ("H", 3), "effective_stiffness": ("H", 3, 3), "stiffness_eigenvalues": ("H", 2),
+    "store_energy": ("H",), "held_back": ("H",),
 }  # fmt: skip
 """What is shown beside the trajectory, and its sizes after (T, N); those that a letter stands for are all alike."""
+OF_SOME_LAWS = ("commanded_stiffness", "store_energy", "held_back")
+"""Of these, what only some laws have; NaN under the others."""
 TRAJECTORY: dict[str, tuple[str | int, ...]] = {
     "velocity": (3,), "command": (3,), "stand": (), "height": (), "height_command": (),
     "position": (2,), "arm_error": ("U",), "arm_velocity": ("U",), "arm_torque": ("U",), "arm_at_limit": (),
@@ -57,7 +60,8 @@ class Recording:
     scene: dict[str, np.ndarray]
     """By the names in `SCENE`, (T, N, ...) each: robots' `qpos`; hands, their references and the forces on them, world
     frame [m, N]; heading frames; commanded (diagonal; NaN where a law commands none) and effective hand stiffness in
-    the heading frame [N/m]; smallest and largest eigenvalue of the arms' joint stiffness [Nm/rad]."""
+    the heading frame [N/m]; smallest and largest eigenvalue of the arms' joint stiffness [Nm/rad]; level of the arms'
+    energy stores [J] and share of the last change of stiffness that was held back (NaN where a law has none)."""
     settings: dict[str, Any]
     """What is not in the arrays: robot, hands, gait period, and the page's settings as they changed."""
 
@@ -109,7 +113,7 @@ def _assemble(arrays: dict[str, np.ndarray], settings: Any) -> Recording:
     for name, shape in SCENE.items():
         value = arrays[f"scene.{name}"]
         _check_array(f"scene.{name}", value, shape, (np.float32, np.float64), sizes)
-        if name != "commanded_stiffness" and not np.isfinite(value).all():
+        if name not in OF_SOME_LAWS and not np.isfinite(value).all():
             raise ValueError(f"scene.{name} has values that are not finite")
     tensors = {name: torch.from_numpy(arrays[f"trajectory.{name}"]) for name in STEPPED}
     return Recording(Trajectory(dt=dt, **tensors), {name: arrays[f"scene.{name}"] for name in SCENE}, settings)

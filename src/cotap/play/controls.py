@@ -160,4 +160,5 @@ def _law_controls(laws: Sequence[str]) -> dict[str, Control]:
     out["alpha"] = Number("alpha", 0.0, 1.0, law.alpha, 0.01)
     out["error"] = Choice("stiffness acts on", ERRORS, law.error)
     out["damping"] = Choice("damping", DAMPINGS, law.damping)
+    out["passive"] = Flag("passive (energy store)", law.passive)
     return out

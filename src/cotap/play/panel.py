@@ -126,7 +126,7 @@ class Panel:
                 for part in ("law", *(f"stiffness_{axis}" for axis in AXES), "null_stiffness", "alpha"):
                     self.bind(f"{robot}.{side}.{part}")
                 with self._gui.add_folder("more", expand_by_default=False):
-                    for part in ("error", "damping"):
+                    for part in ("error", "damping", "passive"):
                         self.bind(f"{robot}.{side}.{part}")
             if robot != ROBOTS[0]:
                 self._second.append(folder)

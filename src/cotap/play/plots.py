@@ -51,7 +51,7 @@ def force_displacement(samples: list[Sample], robot: int, hand: int) -> tuple[np
 
 
 class Plots:
-    """Five plots, made when there is something to plot.
+    """Seven plots, made when there is something to plot.
 
     Args:
         server: The page.
@@ -61,6 +61,7 @@ class Plots:
     """
 
     TITLES = ("hand error [mm]", "arm torque [Nm]", "torso velocity [m/s]", "eigenvalues of K [Nm/rad]",
+              "energy store [J]", "share of a change of K held back",
               "force [N] over displacement along it [mm]")  # fmt: skip
 
     def __init__(
@@ -115,6 +116,7 @@ class Plots:
             (time, *velocity, _column(samples, "command", 0, 0), _column(samples, "velocity", 0, 1),
              _column(samples, "command", 0, 1)),
             (time, *eigenvalues),
+            *((time, *(_column(samples, name, *p) for p in pairs)) for name in ("store_energy", "held_back")),
             _scatter([force_displacement(samples, *p) for p in pairs]),
         ]  # fmt: skip
 
@@ -130,11 +132,11 @@ class Plots:
         dots = [_line(label[p], COLORS[p], dots=True) for p in pairs]
         return [
             self._gui.add_uplot(
-                points, (uplot.Series(label="t [s]" if i < 4 else "mm"), *series), title=title, height=190,
+                points, (uplot.Series(label="mm" if series is dots else "t [s]"), *series), title=title, height=190,
                 scales={"x": uplot.Scale(time=False)}, legend=uplot.Legend(live=False),
             )
-            for i, (title, points, series) in enumerate(
-                zip(self.TITLES, lines, (hands, hands, torso, ends, dots), strict=True)
+            for title, points, series in zip(
+                self.TITLES, lines, (hands, hands, torso, ends, hands, hands, dots), strict=True
             )
         ]  # fmt: skip
 

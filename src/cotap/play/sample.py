@@ -41,6 +41,8 @@ def take_sample(env: HumanoidEnv, fell: torch.Tensor, laws: list[list[str]], for
         "effective_stiffness": effective_stiffness(jacobian_h, stiffness),
         "stiffness_eigenvalues": eigenvalues[..., [0, -1]],
     }
+    absent = torch.full_like(stiffness[..., 0, 0], math.nan)
+    scene |= {name: env.upper_body.report.get(name, absent).clone() for name in ("store_energy", "held_back")}
     return {name: value.numpy() for name, value in (trajectory_row(env, fell) | scene).items()}
 
 

@@ -30,7 +30,7 @@ DOMAIN = ("friction", "mass_scale")
 VELOCITIES = ("velocity_x", "velocity_y", "yaw_rate")
 """Commands that wait while robots stand."""
 LAW_FIELDS = {f"stiffness_{axis}": "stiffness" for axis in AXES} | {
-    name: name for name in ("null_stiffness", "alpha", "error", "damping")
+    name: name for name in ("null_stiffness", "alpha", "error", "damping", "passive")
 }
 """Controls of an arm, with the field of its law that each sets."""
 
@@ -207,9 +207,12 @@ class Session:
             self._set_mass()
 
     def _law(self, robot: int, side: str) -> LawConfig:
-        own = {n: self.values[f"{ROBOTS[robot]}.{side}.{n}"] for n in ("null_stiffness", "alpha", "error", "damping")}
-        x, y, z = (self.values[f"{ROBOTS[robot]}.{side}.stiffness_{axis}"] for axis in AXES)
-        return replace(LawConfig(self.values[f"{ROBOTS[robot]}.{side}.law"], (x, y, z)), **own)
+        arm = f"{ROBOTS[robot]}.{side}"
+        name = self.values[f"{arm}.law"]
+        own = {n: self.values[f"{arm}.{n}"] for n in ("null_stiffness", "alpha", "error", "damping")}
+        own["passive"] = self.values[f"{arm}.passive"] and reads(name, "passive")
+        x, y, z = (self.values[f"{arm}.stiffness_{axis}"] for axis in AXES)
+        return replace(LawConfig(name, (x, y, z)), **own)
 
     def _set_mass(self) -> None:
         scale = torch.tensor([self.values[f"{r}.mass_scale"] for r in ROBOTS])

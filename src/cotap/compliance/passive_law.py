@@ -1,0 +1,112 @@
+"""CoTaP's law with an energy store per arm: what its changing stiffness injects is bounded (`docs/passivity.md`)."""
+
+from __future__ import annotations
+
+import torch
+
+from cotap.compliance.arguments import full_precision
+from cotap.compliance.geodesic import held_stiffness, spring_energy
+from cotap.compliance.interface import Arms, ArmState, LawParameters, LawReport, Remembering, TorqueLaw
+from cotap.compliance.laws import CoTaPLaw, LawConfig
+from cotap.compliance.passivity import EnergyStore
+
+
+class PassiveCoTaPLaw(CoTaPLaw, Remembering):
+    """CoTaP's law; a change of its spring that the store cannot pay is held back.
+
+    With the joint error, the spring changes by its stiffness. With the task error, its rest moves with the pose as
+    well, and counts; that the target moves does not. Reports `store_energy`, the level [J], and `held_back`, the share
+    of the change that was not let through.
+
+    Args:
+        arms: What is driven.
+        cfg: See `CoTaPLaw`; and how much the store holds and gives per time.
+    """
+
+    def __init__(self, arms: Arms, cfg: LawConfig) -> None:
+        CoTaPLaw.__init__(self, arms, cfg)
+        Remembering.__init__(self)
+        self._store = EnergyStore(cfg.store_energy, ceiling=cfg.store_energy, power=cfg.store_power)
+
+    @full_precision
+    def __call__(self, state: ArmState, parameters: LawParameters) -> tuple[TorqueLaw, LawReport]:
+        """See `CoTaPLaw`."""
+        torque, report = super().__call__(state, parameters)
+        undamped = state.position
+        if self._cfg.damping == "critical" and state.target_velocity is not None:
+            undamped = undamped + state.dt * state.target_velocity  # what moves with the reference is not damped
+        self.memory |= {
+            "stiffness": torque.stiffness.flatten(-2),
+            "damping": torque.damping.flatten(-2),
+            "undamped": undamped,
+        }
+        return torque, report
+
+    def _in_force(
+        self, state: ArmState, stiffness: torch.Tensor, error: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
+        size = stiffness.shape[-2:]
+        old = self.recall(state, "stiffness", stiffness.flatten(-2)).unflatten(-1, size)
+        joint_error = state.target - state.position
+        before = error  # of the spring in force, carried along with the target
+        if self._cfg.error == "task":
+            before = joint_error + self.recall(state, "rest", error - joint_error)
+        level = self._filled(state, size)
+        room = self._store.available(level, state.dt)
+        energy = spring_energy(stiffness, error) - spring_energy(old, before)
+        share = torch.ones_like(level)
+        held = (energy > room) & energy.isfinite()
+        if held.any():
+            stiffness, error = stiffness.clone(), error.clone()
+            given = (x[held] for x in (old, stiffness, before, error, room))
+            stiffness[held], error[held], share[held], energy[held] = held_spring(*given)
+        level = self._store.drawn(level, energy)
+        self.memory["store"] = level.unsqueeze(-1)
+        if self._cfg.error == "task":
+            self.memory["rest"] = error - joint_error
+        return stiffness, error, {"store_energy": level, "held_back": 1.0 - share}
+
+    def _filled(self, state: ArmState, size: torch.Size) -> torch.Tensor:
+        """The store's level (N, A) once the damping of the past step is in it."""
+        q = state.position
+        full = torch.full_like(q[..., :1], self._store.first)
+        level = self.recall(state, "store", full).squeeze(-1)
+        none = torch.zeros_like(q[..., :1]).expand(*q.shape[:-1], size.numel())
+        damping = self.recall(state, "damping", none).unflatten(-1, size)
+        moved = q - self.recall(state, "undamped", q)
+        # See `passivity.damping_energy`.
+        dissipated = 2.0 / state.dt * spring_energy(damping, moved)
+        return self._store.filled(level, dissipated.to(level.dtype))
+
+
+def held_spring(
+    old: torch.Tensor, new: torch.Tensor, before: torch.Tensor, error: torch.Tensor, room: torch.Tensor
+) -> tuple[torch.Tensor, ...]:
+    """From one spring to another, as far as `room` (R,) [J] allows: first the rest, then the stiffness.
+
+    Args:
+        old: (R, n, n) stiffness in force.
+        new: (R, n, n) asked for.
+        before: (R, n) error of the spring in force.
+        error: (R, n) of the one asked for.
+        room: (R,).
+
+    Returns:
+        Stiffness and error to put in force, the share of the change that is made, and what it injects.
+    """
+    shift = error - before
+    bend = spring_energy(old, shift)
+    slope = spring_energy(old, error) - spring_energy(old, before) - bend
+    # Largest r with slope r + bend r^2 <= room, but for rounding.
+    most = room.double() - 1e-6 * spring_energy(old, before)
+    root = (slope.square() + 4.0 * bend * most).clamp_min(0.0).sqrt()
+    tiny = torch.finfo(root.dtype).tiny
+    part = torch.where(slope > 0.0, 2.0 * most / (slope + root + tiny), (root - slope) / (2.0 * bend + tiny))
+    part = torch.where(slope + bend <= most, 1.0, part.clamp(0.0, 1.0)).to(shift.dtype)
+    reached = torch.where((part < 1.0).unsqueeze(-1), before + part.unsqueeze(-1) * shift, error)
+    spent = spring_energy(old, reached) - spring_energy(old, before)
+    none = spent > room
+    reached, spent = torch.where(none.unsqueeze(-1), before, reached), torch.where(none, 0.0, spent)
+    held = held_stiffness(old, new, reached, room - spent)
+    share = torch.where(none, 0.0, part * held.share)
+    return held.stiffness, reached, share.to(shift.dtype), spent + held.energy
