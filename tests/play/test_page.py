@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import functools
+import http.server
 import math
 import shutil
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -86,6 +90,33 @@ class Page:
         return float((sample["hand_w"] - sample["hand_reference_w"])[robot, hand, 0])
 
 
+class Tunnel:
+    """A port that leads to another, as `ssh -L` makes one: bytes pass unchanged."""
+
+    def __init__(self, target: int) -> None:
+        self._target = target
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.port = self._listener.getsockname()[1]
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def _accept(self) -> None:
+        with contextlib.suppress(OSError):  # closed
+            while True:
+                near, _ = self._listener.accept()
+                far = socket.create_connection(("127.0.0.1", self._target))
+                for source, sink in ((near, far), (far, near)):
+                    threading.Thread(target=self._pass, args=(source, sink), daemon=True).start()
+
+    @staticmethod
+    def _pass(source: socket.socket, sink: socket.socket) -> None:
+        with contextlib.suppress(OSError), source, sink:
+            while data := source.recv(1 << 16):
+                sink.sendall(data)
+
+    def close(self) -> None:
+        self._listener.close()
+
+
 @pytest.fixture
 def page(free_port: int, tmp_path: Path, checkpoint: Path) -> Iterator[Page]:
     from playwright.sync_api import sync_playwright
@@ -159,6 +190,34 @@ def test_a_walk_through_the_page(page: Page, tmp_path: Path):
     page.page.screenshot(path=tmp_path / "side_by_side.png")
     assert (tmp_path / "side_by_side.png").stat().st_size > 20_000
     assert page.complaints == []
+
+
+def test_a_website_cannot_use_the_page_and_a_tunnel_can(page: Page, tmp_path: Path):
+    """A page of another origin tries to connect as the page itself does; then the page itself through a tunnel."""
+    port = int(page.page.url.rpartition(":")[2].strip("/"))
+    (tmp_path / "index.html").write_text("<p>a website</p>")
+    handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=tmp_path)
+    website = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    threading.Thread(target=website.serve_forever, daemon=True).start()
+    connect = """url => new Promise(done => {
+        const socket = new WebSocket(url, ["viser-v" + "0.0.0"]);
+        socket.onopen = () => done("open"); socket.onerror = () => done("refused")})"""
+    stranger = page.page.context.new_page()
+    stranger.goto(f"http://127.0.0.1:{website.server_port}")
+    for host in ("127.0.0.1", "localhost"):
+        assert stranger.evaluate(connect, f"ws://{host}:{port}") == "refused"
+    assert stranger.evaluate("url => fetch(url).then(() => 'read', () => 'refused')", f"http://127.0.0.1:{port}") == (
+        "refused"
+    )
+    assert len(page.app.server.get_clients()) == 1
+    stranger.close()
+    website.shutdown()
+    tunnel = Tunnel(port)
+    through = page.page.context.new_page()
+    through.goto(f"http://localhost:{tunnel.port}")
+    through.get_by_text("control steps/s").wait_for(timeout=1000.0 * PATIENCE_S)
+    page.until("a viewer through the tunnel", lambda: len(page.app.server.get_clients()) == 2)
+    tunnel.close()
 
 
 def test_several_viewers_and_one_that_leaves_do_not_stop_it(page: Page):

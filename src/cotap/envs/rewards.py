@@ -39,7 +39,7 @@ class RobotScales:
     hip_waist: tuple[int, ...]
     """Lower joints that straight walking does not need: those that do not pitch, ankles aside."""
     foot_clearance_m: float
-    """Height of the sole at mid-swing that is asked for: a tenth of the torso's nominal height."""
+    """Least height of the sole at mid-swing that is asked for: 0.07 of the torso's nominal height."""
     foot_distance_m: float
     """Sideways distance of the soles below which feet are too close: 0.45 of that in the default pose."""
     torso_ahead_m: float
@@ -56,7 +56,7 @@ class RobotScales:
         ankles = {body.joint for foot in spec.feet for body in spec.bodies if body.name == foot.body}
         hip_waist = (i for i, j in enumerate(joints[:num_lower]) if j.name not in ankles and not spec.pitches(j.name))
         default = torch.tensor([j.default_rad for j in joints])
-        clearance, distance = 0.1 * spec.nominal_height_m, 0.45 * spec.sole_distance_m
+        clearance, distance = 0.07 * spec.nominal_height_m, 0.45 * spec.sole_distance_m
         low, high = center - half, center + half
         falling_time = math.sqrt(0.9 * spec.nominal_height_m / GRAVITY_M_S2)
         return cls(
@@ -154,7 +154,7 @@ def _upper(s: StepRecord) -> slice:
 
 
 def swing_clearance(swing: torch.Tensor, peak_m: float) -> torch.Tensor:
-    """Height that a sole should have at `swing` progress: a smooth bump of height `peak_m` [m]."""
+    """Height that a sole should have at least at `swing` progress: a smooth bump of height `peak_m` [m]."""
     return peak_m * torch.sin(torch.pi * swing).square()
 
 
@@ -227,16 +227,16 @@ class LowerRewards:
         """Squared angular velocity of the torso about its horizontal axes."""
         return s.state.torso_angular_velocity_t[:, :2].square().sum(1)
 
-    @term(2.0)
+    @term(1.0)
     def contact_schedule(s: StepRecord) -> torch.Tensor:
         """Share of feet that are on the ground, or off it, as the gait's phase asks."""
         return (s.state.foot_contact == s.desired_contact).float().mean(1)
 
     @term(-60.0)
     def swing_height(s: StepRecord) -> torch.Tensor:
-        """Error of the swinging soles' height [m]; linear: the first centimetre is worth as much as the last."""
-        error = s.state.foot_pos_w[:, :, 2] - swing_clearance(s.swing, s.scales.foot_clearance_m)
-        return (error.abs() * ~s.desired_contact).sum(1)
+        """Height that the swinging soles lack [m]; linear: the first centimetre is worth as much as the last."""
+        missing = swing_clearance(s.swing, s.scales.foot_clearance_m) - s.state.foot_pos_w[:, :, 2]
+        return (missing.clamp_min(0.0) * ~s.desired_contact).sum(1)
 
     @term(-5.0)
     def foot_slip(s: StepRecord) -> torch.Tensor:
