@@ -72,7 +72,7 @@ class Options(Generic[P]):
     plot: str = ""
     """Write a plot here (PNG)."""
     video: str = ""
-    """Write a video of the first env here (MP4), of a tour of commands for velocity-tracking; a contact sheet
+    """Write a video of the first env here (MP4), of a series of commands for velocity-tracking; a contact sheet
     (NAME_frames.png) goes beside it."""
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 # MuJoCo's extension module has no type stubs.
 # pyright: reportAttributeAccessIssue=false
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import mujoco
@@ -80,15 +80,21 @@ def render_frames(
             yield renderer.render().copy()
 
 
+Rgba = tuple[float, float, float, float]
 REFERENCE_RGBA = (0.15, 0.35, 0.9, 1.0)
 FORCE_RGBA = (0.85, 0.1, 0.1, 1.0)
 FORCE_SCALE_M_PER_N = 0.006
 LONGEST_ARROW_M = 0.8
 
 
+Mark = Callable[[mujoco.MjvScene, mujoco.MjData, int], None]
+"""Adds to the scene of a picture, of this number, what is to be seen beside the robot."""
+
+
 def film_frames(
-    env: HumanoidEnv, film: torch.Tensor, width: int = 640, height: int = 480, camera: str = "track"
-) -> Iterator[np.ndarray]:
+    env: HumanoidEnv, film: torch.Tensor, width: int = 640, height: int = 480, camera: str = "track",
+    mark: Mark | None = None,
+) -> Iterator[np.ndarray]:  # fmt: skip
     """Images (height, width, 3) uint8 of a film (T, nq + 6 H) of `record_rollout`.
 
     Blue balls are the hands' references, red arrows the forces, which point at the hands.
@@ -97,46 +103,57 @@ def film_frames(
     data = mujoco.MjData(model)
     sides = [arm.side for arm in env.spec.arms]
     with open_renderer(model, width, height) as renderer:
-        for row in film.double().numpy():
+        for number, row in enumerate(film.double().numpy()):
             data.qpos[:] = row[: model.nq]
             mujoco.mj_forward(model, data)
             renderer.update_scene(data, camera)
             points, forces = row[model.nq :].reshape(2, len(sides), 3)
             for side, point, force in zip(sides, points, forces, strict=True):
-                _add_ball(renderer.scene, point)
+                add_ball(renderer.scene, point, REFERENCE_RGBA)
                 if np.linalg.norm(force) > 0.0:
-                    _add_arrow(renderer.scene, data.site(f"{side}_hand").xpos, force)
+                    add_force(renderer.scene, data.site(f"{side}_hand").xpos, force)
+            if mark:
+                mark(renderer.scene, data, number)
             yield renderer.render().copy()
 
 
-def _add_ball(scene: mujoco.MjvScene, center: np.ndarray) -> None:
+def add_ball(scene: mujoco.MjvScene, center: np.ndarray, rgba: Rgba, radius_m: float = 0.035) -> None:
+    """Draw a ball at `center` (3,) [m]."""
     scene.ngeom += 1
     mujoco.mjv_initGeom(
-        scene.geoms[scene.ngeom - 1], mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, 0.035), center, np.eye(3).ravel(),
-        np.array(REFERENCE_RGBA, dtype=np.float32),
+        scene.geoms[scene.ngeom - 1], mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, radius_m), center, np.eye(3).ravel(),
+        np.array(rgba, dtype=np.float32),
     )  # fmt: skip
 
 
-def _add_arrow(scene: mujoco.MjvScene, tip: np.ndarray, force: np.ndarray) -> None:
-    size = np.linalg.norm(force)
-    tail = tip - force / size * min(FORCE_SCALE_M_PER_N * size, LONGEST_ARROW_M)
+def add_arrow(scene: mujoco.MjvScene, tail: np.ndarray, tip: np.ndarray, rgba: Rgba) -> None:
+    """Draw an arrow from `tail` (3,) to `tip` (3,) [m]."""
     scene.ngeom += 1
     geom = scene.geoms[scene.ngeom - 1]
     mujoco.mjv_initGeom(
         geom, mujoco.mjtGeom.mjGEOM_ARROW, np.zeros(3), np.zeros(3), np.eye(3).ravel(),
-        np.array(FORCE_RGBA, dtype=np.float32),
+        np.array(rgba, dtype=np.float32),
     )  # fmt: skip
     mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_ARROW, 0.02, tail, tip)
 
 
-def film_video(path: Path, env: HumanoidEnv, film: torch.Tensor, sheet: Path | None = None) -> None:
-    """Write a video (and a contact sheet) of a film.
+def add_force(scene: mujoco.MjvScene, point: np.ndarray, force: np.ndarray) -> None:
+    """Draw a force (3,) [N] as an arrow that ends at the `point` (3,) [m] that it acts at."""
+    size = float(np.linalg.norm(force))
+    tail = point - force / size * min(FORCE_SCALE_M_PER_N * size, LONGEST_ARROW_M)
+    add_arrow(scene, tail, point, FORCE_RGBA)
+
+
+def film_video(
+    path: Path, env: HumanoidEnv, film: torch.Tensor, sheet: Path | None = None, mark: Mark | None = None
+) -> None:
+    """Write a video (and a contact sheet) of a film; picture k is of its row `STRIDE` k.
 
     Raises:
         RenderingUnavailable: there is no OpenGL to be had.
     """
     part = film[::STRIDE]
-    write_film(path, film_frames(env, part), len(part), env.dt, sheet)
+    write_film(path, film_frames(env, part, mark=mark), len(part), env.dt, sheet)
 
 
 def write_film(path: Path, frames: Iterator[np.ndarray], count: int, dt: float, sheet: Path | None = None) -> None:

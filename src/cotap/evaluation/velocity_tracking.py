@@ -108,7 +108,7 @@ class VelocityTracking(RolloutProtocol):
         plot_tracking(path, self.trajectory, result["settings"]["env"]["gait"]["period_s"], self.settle_seconds)
 
     def video(self, path: Path, sheet: Path, env: HumanoidEnv, policy: PolicyFunction) -> None:
-        """Write a video of one robot on a tour of commands, and a contact sheet."""
+        """Write a video of one robot under a series of commands, and a contact sheet."""
         from cotap.evaluation.render import tour_video
 
         pose = mirrored_pose(env, self.arm_pose) if self.arms == "held" else None

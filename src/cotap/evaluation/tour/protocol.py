@@ -14,7 +14,7 @@ from tqdm import tqdm
 from cotap.agents.actors import as_dict
 from cotap.checks import require_one_of, require_positive_int, require_range
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
-from cotap.envs.punches import PunchConfig
+from cotap.envs.punches import PunchConfig, Punches
 from cotap.evaluation import report
 from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.protocol import Protocol
@@ -29,6 +29,8 @@ ENGINES = ("mujoco", "pybullet")
 SEED_OFFSET = 2**62 + 1
 """What is added to the seed: no other seed of the package may be that large, so that no training sees a tour."""
 _WAYPOINTS, _ARMS = 1, 2  # streams of random numbers; that of punches is 0
+FALL_S = 2.0
+"""How long a film goes on after a fall [s]."""
 CONTROL_S, PHYSICS_S = 0.02, 0.002
 """Control and physics step [s]."""
 
@@ -144,8 +146,9 @@ class Tour(Protocol):
             film.append(picture_row(env))
             if not scorer.standing.any():
                 break
-        self.film = torch.stack(film).cpu()
-        return scorer.measures().report(self.segment_s, env.dt, self.seed)
+        measures = scorer.measures()
+        self.film = torch.stack(film).cpu()[: round((float(measures.survival_s[0]) + FALL_S) / env.dt)]
+        return measures.report(self.segment_s, env.dt, self.seed)
 
     def _begin(self, env: HumanoidEnv) -> TensorDict:
         """Let all robots go, asked for nothing yet; return the observations."""
@@ -189,6 +192,16 @@ class Tour(Protocol):
         for axis in (left, right):
             axis.grid(alpha=0.2)
         report.save_figure(figure, path)
+
+    def video(self, path: Path, sheet: Path, env: HumanoidEnv, policy: PolicyFunction) -> None:  # noqa: ARG002
+        """Write a video of the first run, with its waypoints and punches, and a contact sheet."""
+        from cotap.evaluation.render import STRIDE, film_video
+        from cotap.evaluation.tour.film import TourMarks
+
+        waypoints, _ = self.draw(env.spec, self.stance, range(1))
+        punches = Punches(env.cfg.forces.punches, env.num_actions, 1, env.dt)
+        marks = TourMarks(env.spec, waypoints[0], self.segment_s, punches, STRIDE * env.dt)
+        film_video(path, env, self.film, sheet, marks)
 
 
 def _pelvis(env: HumanoidEnv) -> tuple[torch.Tensor, torch.Tensor]:
