@@ -184,7 +184,7 @@ def exports(path: Path) -> None:
 @pytest.mark.parametrize(
     ("env", "message"),
     [
-        (None, "has no 'env' in its config"),
+        (None, "has no usable environment config: 'env' is missing"),
         (3, "has no usable environment config: HumanoidEnvConfig must be a table of fields, got int 3"),
         ({"control_dt": "x"}, "has no usable environment config: control_dt must be of type float, got str 'x'"),
         ({"control_dt": -1.0}, "has no usable environment config: control_dt must lie in"),

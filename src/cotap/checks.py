@@ -81,8 +81,10 @@ def require_interval(name: str, value: tuple[float, float]) -> tuple[float, floa
 
 
 def reason_of(error: BaseException) -> str:
-    """First line of what an error says, or its kind if it says nothing."""
-    return (str(error) or type(error).__name__).splitlines()[0]
+    """First line of what an error says, to be printed, or its kind if it says nothing; of a key, that it is missing."""
+    if isinstance(error, KeyError) and error.args:
+        return f"{quoted(error.args[0])} is missing"
+    return legible((str(error) or type(error).__name__).splitlines()[0], 1000)
 
 
 def require_one_of(name: str, value: str, known: Collection[str]) -> str:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cotap.checks import legible, quoted, reason_of
+from cotap.checks import quoted, reason_of
 
 LARGEST_TEXT = 1 << 28
 """Bytes of text that are read; as numbers it takes ten times as much memory."""
@@ -90,7 +90,7 @@ def read_arrays(path: Path | str, names: Collection[str], largest: int) -> dict[
         except OSError as error:
             raise InputError(f"cannot be opened or read from disk: {error}") from error
         except Exception as error:  # zip, zlib and numpy each fail in ways of their own on rubbish
-            raise InputError(f"is damaged: {legible(reason_of(error))}") from error
+            raise InputError(f"is damaged: {reason_of(error)}") from error
 
 
 def _open(path: Path | str) -> zipfile.ZipFile:
@@ -98,7 +98,7 @@ def _open(path: Path | str) -> zipfile.ZipFile:
     try:
         return zipfile.ZipFile(path)
     except Exception as error:  # as above
-        raise InputError(f"is damaged or no npz file: {legible(reason_of(error))}") from error
+        raise InputError(f"is damaged or no npz file: {reason_of(error)}") from error
 
 
 def _read_array(archive: zipfile.ZipFile, name: str, info: zipfile.ZipInfo) -> np.ndarray:

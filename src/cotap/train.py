@@ -16,7 +16,7 @@ from typing import Annotated, Any
 import tyro
 
 from cotap import __version__
-from cotap.checks import require_one_of, shortened
+from cotap.checks import quoted, reason_of, require_one_of, shortened
 from cotap.configs import (
     BASE_RECIPES,
     DISTILL_RECIPES,
@@ -191,7 +191,7 @@ def _resumed_config(checkpoint: str, recipe: str, stage: str, kind: type[Any]) -
 
     content = load_checkpoint(checkpoint)
     if content.get("kind", stage) != stage:
-        raise ValueError(f"--resume {checkpoint!r}: a checkpoint of stage {content['kind']!r}, not {stage!r}")
+        raise ValueError(f"--resume {checkpoint!r}: a checkpoint of stage {quoted(content['kind'])}, not {stage!r}")
     if not content.get("learner"):
         raise ValueError(
             f"--resume {checkpoint!r}: a shipped policy has no optimiser and cannot go on; train from nothing, or "
@@ -209,7 +209,7 @@ def _config_of(checkpoint: str, kind: type[Any]) -> Any:
     try:
         return from_plain(kind, content["config"]["training"])
     except MALFORMED as error:
-        raise CheckpointError(f"checkpoint {checkpoint!r} has no usable config: {error}") from error
+        raise CheckpointError(f"checkpoint {checkpoint!r} has no usable config: {reason_of(error)}") from error
 
 
 def _peek(args: list[str], option: str) -> str:
@@ -241,7 +241,9 @@ def train_distill(options: DistillOptions) -> Path:
         base = load_checkpoint(options.base_checkpoint)
         require_parts(options.base_checkpoint, base, ("kind", "layout", "model"))
         if base["kind"] != "base":
-            raise CheckpointError(f"checkpoint {options.base_checkpoint!r} is of stage {base['kind']!r}, not 'base'")
+            raise CheckpointError(
+                f"checkpoint {options.base_checkpoint!r} is of stage {quoted(base['kind'])}, not 'base'"
+            )
     return _train("distill", options, base)
 
 

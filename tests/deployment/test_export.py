@@ -276,9 +276,10 @@ def test_a_part_of_another_kind_is_named(name, entries, message, policy, policy_
 def test_rubbish_and_absence_are_distinguished(tmp_path):
     with pytest.raises(PolicyError, match="does not exist"):
         OnnxPolicy(tmp_path / "none.onnx")
-    (tmp_path / "rubbish.onnx").write_bytes(b"not onnx at all")
-    with pytest.raises(PolicyError, match="cannot be read as ONNX"):
-        OnnxPolicy(tmp_path / "rubbish.onnx")
+    for rubbish in (b"not onnx at all", b"", bytes(100)):
+        (tmp_path / "rubbish.onnx").write_bytes(rubbish)
+        with pytest.raises(PolicyError, match=r"cannot be read as ONNX: it is damaged or no ONNX file$"):
+            OnnxPolicy(tmp_path / "rubbish.onnx")
 
 
 def test_one_command_times_inference_without_torch(policy_file, tmp_path, capsys):

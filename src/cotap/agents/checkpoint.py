@@ -7,7 +7,6 @@ import hashlib
 import io
 import json
 import math
-import pickle
 import re
 import warnings
 import zipfile
@@ -17,7 +16,7 @@ from typing import Any
 
 import torch
 
-from cotap.checks import legible, quoted, reason_of
+from cotap.checks import legible, quoted
 from cotap.files import write_atomically
 from cotap.inputs import InputError, read_bytes
 
@@ -134,9 +133,9 @@ def _reason(error: Exception) -> str:
     asked = re.search(r"GLOBAL (\S+)", str(error))
     if asked:
         return f"it asks for {legible(asked[1])}, which no checkpoint needs; nothing was run"
-    if isinstance(error, pickle.UnpicklingError) or "weights_only" in str(error):
-        return "it is no archive of plain tensors and numbers, and nothing else is read"
-    return legible(reason_of(error))
+    if isinstance(error, InputError):
+        return str(error)
+    return "it is no archive of plain tensors and numbers, and nothing else is read"
 
 
 def _refuse_compressed(data: bytes) -> None:
@@ -144,7 +143,22 @@ def _refuse_compressed(data: bytes) -> None:
     if zipfile.is_zipfile(io.BytesIO(data)):
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             if sum(entry.file_size for entry in archive.infolist()) > len(data):
-                raise ValueError("its entries unpack to more than the whole file holds")
+                raise InputError("its entries unpack to more than the whole file holds")
+
+
+def load_weights(model: torch.nn.Module, weights: dict[str, Any]) -> None:
+    """Take over networks. Raises ValueError naming the first weight that is missing, is not theirs or does not fit."""
+    present = model.state_dict()
+    for name in dict.fromkeys((*present, *weights)):
+        where = legible(str(name))
+        if name not in weights:
+            raise ValueError(f"weight {where} is missing")
+        if name not in present:
+            raise ValueError(f"weight {where} is of other networks")
+        shape = getattr(weights[name], "shape", None)
+        if shape != present[name].shape:
+            raise ValueError(f"weight {where} must be of shape {tuple(present[name].shape)}, got {quoted(shape)}")
+    model.load_state_dict(weights)
 
 
 def require_parts(path: Path | str, content: dict[str, Any], parts: Collection[str]) -> None:

@@ -8,7 +8,8 @@ from typing import Any
 import torch
 
 from cotap.agents.actors import DualActorCritic, as_dict
-from cotap.agents.checkpoint import MALFORMED, CheckpointError, require_layout, same
+from cotap.agents.checkpoint import MALFORMED, CheckpointError, load_weights, require_layout, same
+from cotap.checks import reason_of
 
 REFITTED = ("terms", "critic_terms")
 """What two layouts may differ in for `refit` to go from one to the other."""
@@ -46,9 +47,9 @@ def take_over(path: str, content: dict[str, Any], model: DualActorCritic, env: A
         if refits:
             # For the statistics of what is new.
             model.update_normalizers(as_dict(env.get_observations(), next(model.parameters()).device))
-        model.load_state_dict(refit(content["model"], saved, model, present) if refits else content["model"])
+        load_weights(model, refit(content["model"], saved, model, present) if refits else content["model"])
     except MALFORMED as error:
-        raise CheckpointError(f"checkpoint {path!r} has other networks: {error}") from error
+        raise CheckpointError(f"checkpoint {path!r} has other networks: {reason_of(error)}") from error
     return refits
 
 

@@ -35,6 +35,7 @@ from cotap.agents.ranks import Ranks
 from cotap.agents.refit import take_over
 from cotap.agents.run_log import RunLog, Unfailing, say
 from cotap.agents.runner_config import RunnerConfig
+from cotap.checks import reason_of
 
 CHECKPOINT_PATTERN = "checkpoint_*.pt"
 MODEL = ("collision", "unevenness_m", "fixed_base")
@@ -302,7 +303,9 @@ class DualRunner(OnPolicyRunner):
                 env.samples = content["samples"]
                 say(f"{path}: no simulator states for this run; starting those afresh")
         except MALFORMED as error:
-            raise CheckpointError(f"checkpoint {path!r} has states that do not fit this run: {error}") from error
+            raise CheckpointError(
+                f"checkpoint {path!r} has states that do not fit this run: {reason_of(error)}"
+            ) from error
         return content.get("infos", {})
 
     def _share_of(self, content: dict[str, Any]) -> dict[str, Any]:

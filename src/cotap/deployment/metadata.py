@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
-from cotap.checks import is_finite, legible, quoted, require_one_of, require_positive_int, require_range
+from cotap.checks import is_finite, legible, quoted, reason_of, require_one_of, require_positive_int, require_range
 
 FORMAT = "cotap-policy-3"
 INPUT, TARGETS = "observation", "joint_targets"
@@ -95,7 +95,7 @@ def read_metadata(where: str, properties: Mapping[str, str]) -> PolicyMetadata:
     try:
         _check(metadata)
     except (ValueError, TypeError, LookupError, RecursionError) as error:
-        raise PolicyError(f"{where}: {error or type(error).__name__}") from error
+        raise PolicyError(f"{where}: {reason_of(error)}") from error
     return metadata
 
 

@@ -41,6 +41,8 @@ def require_plain_graph(data: bytes) -> None:
     float32, float64 and integers, or has loops, branches or functions, whose run or unfolding may have no end."""
     if _EXTERNAL.search(data):
         raise ValueError("its weights lie in another file, which is not read; export them into one")
+    if not any(kind == "graph" for kind, _ in _parts("model", data)):
+        raise ValueError("it is damaged or no ONNX file")
     left = [("model", data)]
     while left:
         kind, message = left.pop()

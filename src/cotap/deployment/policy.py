@@ -61,7 +61,7 @@ class OnnxPolicy:
             properties = self._session.get_modelmeta().custom_metadata_map
             inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
         except Exception as error:  # onnxruntime's errors share no base but this
-            raise PolicyError(f"{where} cannot be read as ONNX: {shortened(reason_of(error))}") from error
+            raise PolicyError(f"{where} cannot be read as ONNX: {reason_of(error)}") from error
         self.metadata = read_metadata(where, properties)
         joints, width = len(self.metadata.joints), self.metadata.observation_width
         self._require(where, "inputs", inputs, {INPUT: [1, width]})

@@ -11,8 +11,8 @@ from typing import Any
 import torch
 
 from cotap.agents.actors import AgentLayout, DualActorCritic
-from cotap.agents.checkpoint import MALFORMED, CheckpointError, load_checkpoint, require_parts
-from cotap.checks import require_one_of, require_positive_int
+from cotap.agents.checkpoint import MALFORMED, CheckpointError, load_checkpoint, load_weights, require_parts
+from cotap.checks import reason_of, require_one_of, require_positive_int
 from cotap.configs import from_plain
 from cotap.envs import HumanoidEnvConfig
 
@@ -90,9 +90,11 @@ def load_policy(path: Path | str) -> Policy:
         networks = AgentLayout.from_plain(agents)
         _require_fitting(networks, layout)
         model = DualActorCritic(networks, hidden, 1.0)
-        model.load_state_dict(weights)
+        load_weights(model, weights)
     except MALFORMED as error:
-        raise CheckpointError(f"checkpoint {str(path)!r} has networks that do not fit its config: {error}") from error
+        raise CheckpointError(
+            f"checkpoint {str(path)!r} has networks that do not fit its config: {reason_of(error)}"
+        ) from error
     model.eval()
     return Policy(model, layout, content["kind"], env_config)
 
@@ -114,8 +116,8 @@ def _env_config_of(path: Path | str, content: dict[str, Any]) -> HumanoidEnvConf
         cfg = from_plain(HumanoidEnvConfig, content["config"]["training"]["env"])
         cfg.backend = "auto"  # the one it was trained on may not be installed here
         cfg.check()
-    except KeyError as error:
-        raise CheckpointError(f"checkpoint {str(path)!r} has no {error} in its config") from error
     except MALFORMED as error:
-        raise CheckpointError(f"checkpoint {str(path)!r} has no usable environment config: {error}") from error
+        raise CheckpointError(
+            f"checkpoint {str(path)!r} has no usable environment config: {reason_of(error)}"
+        ) from error
     return cfg

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from cotap.checks import legible, quoted, reason_of, require_finite, require_range
+from cotap.checks import quoted, reason_of, require_finite, require_range
 from cotap.evaluation.disturbance import response_measures, window_measures
 from cotap.evaluation.metrics import summarize, tracking_measures
 from cotap.evaluation.rollout import STEPPED, Trajectory
@@ -89,7 +89,7 @@ def load_recording(path: Path | str) -> Recording:
     except KeyError as error:
         raise RecordingError(f"{str(path)!r} is not a cotap recording: it lacks {error}") from error
     except (ValueError, TypeError, RecursionError) as error:  # no JSON, or none of a table
-        raise RecordingError(f"{str(path)!r} is not a cotap recording: {legible(reason_of(error))}") from error
+        raise RecordingError(f"{str(path)!r} is not a cotap recording: {reason_of(error)}") from error
     if kind != FORMAT or version != VERSION:
         raise RecordingError(
             f"{str(path)!r} is a {quoted(kind)} of version {quoted(version)}; this cotap reads {FORMAT} {VERSION}"

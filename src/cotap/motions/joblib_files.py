@@ -21,7 +21,7 @@ from typing import Any, BinaryIO, ClassVar
 
 import numpy as np
 
-from cotap.checks import legible, quoted, reason_of
+from cotap.checks import legible, quoted
 from cotap.inputs import InputError, read_bytes
 from cotap.motions.library import MotionError
 
@@ -213,5 +213,4 @@ def load_joblib(path: Path) -> Any:
     except (
         Exception
     ) as error:  # opcodes of a hostile file run into whatever their operands lack; one bad file is reported
-        reason = f"{type(error).__name__}: {legible(reason_of(error))}"
-        raise MotionError(f"motion file {str(path)!r} is damaged or no joblib file: {reason}") from error
+        raise MotionError(f"motion file {str(path)!r} is damaged or no joblib file") from error
