@@ -137,6 +137,7 @@ def test_a_vector_has_a_line():
 
 
 TWO_JOINTS = '<body name="odd"><joint name="a" axis="0 1 0"/><joint name="b" axis="0 0 1"/><geom size="0.1"/></body>'
+MESH = mjcf('<geom type="mesh" mesh="limb"/>').replace("<asset>", '<asset><mesh file="limb.stl"/>')
 LONE = '<body name="odd"><joint name="odd" axis="0 1 0" range="-9 9" actuatorfrcrange="-1 1"/><geom size="0.1"/></body>'
 
 
@@ -165,11 +166,16 @@ LONE = '<body name="odd"><joint name="odd" axis="0 1 0" range="-9 9" actuatorfrc
         ),
         (mjcf().replace('"box"', '"plane"'), "plane"),
         ("<mujoco/>", "one body of the world must carry the robot, got none"),
-        ("rubbish", "XML"),
+        ("rubbish", r"robot\.xml' cannot be read: .*XML"),
+        ("version https://git-lfs.github.com/spec/v1\n", r"MJCF '.*robot\.xml' is a Git LFS pointer"),
+        (MESH, r"robot\.xml': mesh .*limb\.stl is a Git LFS pointer"),
+        (MESH.replace("limb", "none"), r"robot\.xml' cannot be read: .*none\.stl"),
+        (mjcf(base=LONE.replace(' range="-9 9"', "").replace("odd", "o" * 100_000)), r"^.{,3000}$"),
     ],
 )
 def test_what_cannot_be_a_robot_is_named(text, message, tmp_path, capsys):
     (tmp_path / "robot.xml").write_text(text)
+    (tmp_path / "limb.stl").write_text("version https://git-lfs.github.com/spec/v1\n")
     assert main(["--mjcf", str(tmp_path / "robot.xml"), "--output", str(tmp_path / "robot.json")]) == 2
     assert re.search(message, capsys.readouterr().err)
     assert not (tmp_path / "robot.json").exists()
@@ -179,6 +185,7 @@ def test_what_cannot_be_a_robot_is_named(text, message, tmp_path, capsys):
     ("arguments", "message"),
     [
         (["--mjcf", "none.xml", "--output", "robot.json"], "MJCF 'none.xml' does not exist"),
+        (["--mjcf", ".", "--output", "robot.json"], "MJCF '.' is no file but a folder"),
         (["--mjcf", "none.xml", "--output", "robot.xml"], "--output must end in .json, got 'robot.xml'"),
         (["--mjcf", "none.xml", "--output", "no/robot.json"], "its folder does not exist"),
         (["--mjcf", "none.xml", "--output", "robot.json", "--velocity-limit", "0"], "velocity_limit must lie in"),

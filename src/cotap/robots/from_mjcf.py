@@ -7,6 +7,7 @@ from __future__ import annotations
 import json
 import re
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,9 @@ import mujoco
 import numpy as np
 import tyro
 
-from cotap.checks import require_range
+from cotap.checks import legible, require_range, shortened
 from cotap.files import require_output, write_atomically
+from cotap.inputs import InputError, require_regular
 
 _SHAPES = {int(getattr(mujoco.mjtGeom, f"mjGEOM_{name.upper()}")): name
            for name in ("sphere", "capsule", "cylinder", "ellipsoid", "box")}  # fmt: skip
@@ -45,10 +47,8 @@ def facts_of(path: Path | str, velocity_limit_rad_s: float = 20.0, source: str =
     Bodies without a joint become part of their parents, and meshes that collide boxes. Visual shapes are left out.
 
     Raises:
-        ValueError: MuJoCo cannot read the file, or the robot has what a `RobotSpec` cannot express.
+        ValueError: the file or a mesh of it cannot be read, or the robot has what a `RobotSpec` cannot express.
     """
-    if not Path(path).is_file():
-        raise ValueError(f"MJCF {str(path)!r} does not exist")
     model = _compiled(path)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -71,7 +71,13 @@ def facts_text(facts: dict[str, Any]) -> str:
 
 def _compiled(path: Path | str) -> mujoco.MjModel:
     """The model, one joint a body."""
-    mj = mujoco.MjSpec.from_file(str(path))
+    where = f"MJCF {str(path)!r}"
+    _require_file(where, path)
+    mj = _read(where, lambda: mujoco.MjSpec.from_file(str(path)))
+    for mesh in mj.meshes:
+        file = Path(path).parent / mj.meshdir / mesh.file
+        if mesh.file and file.exists():  # elsewhere MuJoCo may find it, or else says so
+            _require_file(f"{where}: mesh {legible(str(file))}", file)
     mj.compiler.fusestatic = True
     for sensor in list(mj.sensors):  # bodies that sensors name would be kept
         mj.delete(sensor)
@@ -81,14 +87,29 @@ def _compiled(path: Path | str) -> mujoco.MjModel:
     roots = [body for body in mj.worldbody.bodies if body.find_all("joint")]
     if len(roots) != 1:
         names = ", ".join(body.name for body in roots) or "none"
-        raise ValueError(f"{path}: one body of the world must carry the robot, got {names}")
+        raise ValueError(f"{where}: one body of the world must carry the robot, got {legible(names)}")
     if not roots[0].joints:
         roots[0].add_freejoint()
     for exclude in list(mj.excludes):  # so do bodies that never collide
         exclude.bodyname1, exclude.bodyname2 = (_moved(mj.body(n)) for n in (exclude.bodyname1, exclude.bodyname2))
         if exclude.bodyname1 == exclude.bodyname2:
             mj.delete(exclude)
-    return mj.compile()
+    return _read(where, mj.compile)
+
+
+def _require_file(where: str, path: Path | str) -> None:
+    try:
+        require_regular(path)
+    except InputError as error:
+        raise ValueError(f"{where} {error}") from error
+
+
+def _read(where: str, read: Callable[[], Any]) -> Any:
+    """What MuJoCo makes of a file; what it says if it cannot has many lines, and no file in it."""
+    try:
+        return read()
+    except ValueError as error:
+        raise ValueError(f"{where} cannot be read: {legible(' '.join(str(error).split()), 1000)}") from error
 
 
 def _moved(body: mujoco.MjsBody) -> str:
@@ -200,7 +221,7 @@ def main(argv: list[str] | None = None) -> int:
         text = facts_text(facts)
         write_atomically(Path(options.output), lambda path: path.write_text(text, encoding="utf-8"))
     except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {shortened(str(error))}", file=sys.stderr)
         return 2
     joints = [body["joint"] for body in facts["bodies"] if body["joint"]]
     mass = sum(body["mass"] for body in facts["bodies"])
