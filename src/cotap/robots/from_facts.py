@@ -9,6 +9,8 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from cotap.checks import reason_of
+from cotap.inputs import InputError, read_text
 from cotap.robots.kinematics import body_frame, default_angles
 from cotap.robots.spec import ArmSpec, BodySpec, FootSpec, GeomSpec, JointSpec, RobotSpec
 
@@ -52,13 +54,15 @@ def robot_from_facts(
         ValueError: the file cannot be read as facts, a joint has no gains, or the robot contradicts itself.
     """
     try:
-        content = json.loads(facts.read_text(encoding="utf-8"))
+        content = json.loads(read_text(facts))
         bodies = _arms_last([_body(entry, visuals) for entry in content["bodies"]], arms)
         entries = {entry["name"]: entry["joint"] for entry in content["bodies"]}
         joints = tuple(_joint(entries[b.name], gains) for b in bodies if b.joint is not None)
         excludes = tuple((first, second) for first, second in content["contact_excludes"])
-    except (LookupError, TypeError, UnicodeError, json.JSONDecodeError) as error:
-        raise ValueError(f"{facts}: these are no facts of a robot: {type(error).__name__} {error}") from error
+    except InputError as error:
+        raise ValueError(f"{facts} {error}") from error
+    except (LookupError, TypeError, RecursionError, json.JSONDecodeError) as error:
+        raise ValueError(f"{facts}: these are no facts of a robot: {reason_of(error)}") from error
     names, free = {b.name for b in bodies}, [b.name for b in bodies if b.joint is None]
     if lost := [name for name in entries if name not in names]:
         raise ValueError(f"{facts}: the parents of {', '.join(lost)} do not lead to 'world'")
