@@ -38,7 +38,7 @@ def require_regular(path: Path | str) -> int:
     except InputError:
         raise
     except (OSError, ValueError) as error:  # the latter for a name that no file can have
-        raise InputError(f"cannot be opened or read from disk: {error}") from error
+        raise InputError(f"cannot be opened or read from disk: {reason_of(error)}") from error
     if pointer:
         raise InputError("is a Git LFS pointer, which stands for the file itself; git lfs pull fetches it")
     return status.st_size
@@ -53,7 +53,7 @@ def read_bytes(path: Path | str, largest: int) -> bytes:
         with Path(path).open("rb") as file:
             return file.read(size)  # no more than it had: memory is taken for all that is asked for
     except OSError as error:
-        raise InputError(f"cannot be opened or read from disk: {error}") from error
+        raise InputError(f"cannot be opened or read from disk: {reason_of(error)}") from error
 
 
 def read_text(path: Path | str, largest: int = LARGEST_TEXT) -> str:
@@ -88,7 +88,7 @@ def read_arrays(path: Path | str, names: Collection[str], largest: int) -> dict[
         except InputError:
             raise
         except OSError as error:
-            raise InputError(f"cannot be opened or read from disk: {error}") from error
+            raise InputError(f"cannot be opened or read from disk: {reason_of(error)}") from error
         except Exception as error:  # zip, zlib and numpy each fail in ways of their own on rubbish
             raise InputError(f"is damaged: {reason_of(error)}") from error
 

@@ -119,6 +119,10 @@ def test_the_page_offers_the_clips_that_are_there(library: Path, trained: Path, 
     assert f"{str(library)!r} of this policy is not here: --library names one" in capsys.readouterr().out
     library.unlink()
     assert play_config(load_policy(trained).env_config).motions.clips.library == ""
+    long = load_policy(trained).env_config
+    long.motions.clips.library = 1_000_000 * "n"
+    assert play_config(long).motions.clips.library == ""
+    assert len(capsys.readouterr().out) < 3000
     given = play_config(load_policy(trained).env_config, "given.npz").motions.clips
     assert (given.library, given.library_sha256) == ("given.npz", "")
 

@@ -11,6 +11,7 @@ import torch
 
 from cotap.agents.actors import as_dict
 from cotap.agents.checkpoint import require_layout, sha256
+from cotap.checks import quoted
 from cotap.compliance.laws import LAWS, LawConfig, reads
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.scripted_forces import ForceProfile
@@ -261,5 +262,7 @@ def _find_library(clips: ClipConfig) -> None:
     except MotionError:
         same = False
     if not same:
-        print(f"motion library {clips.library!r} of this policy is not here: --library names one", flush=True)
+        print(
+            f"motion library {quoted(clips.library, 1000)} of this policy is not here: --library names one", flush=True
+        )
         clips.library = clips.library_sha256 = ""
