@@ -18,6 +18,7 @@ from cotap.deployment.safety import SafetyConfig
 from cotap.deployment.scenario import Scenario, TimedCommand, load_scenario
 from cotap.evaluation.law_options import make_passive, parse_law
 from cotap.files import require_output
+from cotap.motions.reference import HELD
 
 
 @dataclass
@@ -37,8 +38,9 @@ class DeployOptions:
     """Repeat so often, with other seeds, and sum up."""
     episode_seconds: float | None = None
     """How long a trial lasts, by default 20 s; a scenario says so itself [s]."""
-    arm_motion: str = ""
-    """Clip that the arms follow, or `random`; empty holds the default pose. A scenario says so itself."""
+    motion: str = HELD
+    """Clip that the arms follow, `mixture` for clips and generated motion as in training, or `none` to hold the default
+    pose. A scenario says so itself."""
     library: str = ""
     """Motion library (.npz) that the clip is taken from; empty for the one that comes with the package."""
     left: str = ""
@@ -89,10 +91,10 @@ def deploy(options: DeployOptions) -> dict[str, Any]:
     require_output("--video", options.video, (".mp4",))
     if options.keyboard and (options.scenario or options.trials > 1):
         raise ValueError("--keyboard goes with neither --scenario nor --trials")
-    if options.scenario and (options.episode_seconds is not None or options.arm_motion or options.library):
-        raise ValueError("--episode-seconds, --arm-motion and --library do nothing with --scenario: it says so itself")
-    if options.library and not options.arm_motion:
-        raise ValueError(f"--library {options.library!r} does nothing without --arm-motion, which names a clip")
+    if options.scenario and (options.episode_seconds is not None or options.motion != HELD or options.library):
+        raise ValueError("--episode-seconds, --motion and --library do nothing with --scenario: it says so itself")
+    if options.library and options.motion == HELD:
+        raise ValueError(f"--library {options.library!r} does nothing without --motion, which names a clip")
     if options.video:
         require_renderer()
     policy = OnnxPolicy(options.policy)
@@ -101,7 +103,7 @@ def deploy(options: DeployOptions) -> dict[str, Any]:
     if not options.scenario:
         if options.episode_seconds is not None:
             scenario.seconds = options.episode_seconds
-        scenario.arms.clip, scenario.arms.library = options.arm_motion, options.library
+        scenario.arms.clip, scenario.arms.library = "" if options.motion == HELD else options.motion, options.library
         scenario.check(spec)
     laws = law_config(policy.metadata)
     for side in ("left", "right"):

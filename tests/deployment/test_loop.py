@@ -405,8 +405,8 @@ def test_bad_scenarios_are_named(text, message, policy_file, tmp_path, capsys):
         (["--keyboard"], "needs a terminal"),
         (["--left", "cotap:alpha=2"], "alpha must lie in"),
         (["--engine", "isaac"], "engine 'isaac' is unknown"),
-        (["--library", "own.npz"], "--library 'own.npz' does nothing without --arm-motion, which names a clip"),
-        (["--arm-motion", "walk", "--library", "none.npz"], "'none.npz' does not exist"),
+        (["--library", "own.npz"], "--library 'own.npz' does nothing without --motion, which names a clip"),
+        (["--motion", "walk", "--library", "none.npz"], "'none.npz' does not exist"),
         (["--left", "pd", "--right", "pd", "--passive"], "--passive is not read by pd"),
     ],
 )
@@ -415,7 +415,7 @@ def test_bad_options_are_named(arguments, message, policy_file, capsys):
     assert message in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("option", [["--episode-seconds", "5"], ["--arm-motion", "random"], ["--library", "own.npz"]])
+@pytest.mark.parametrize("option", [["--episode-seconds", "5"], ["--motion", "mixture"], ["--library", "own.npz"]])
 def test_what_a_scenario_says_itself_is_not_asked_for_beside_it(option, policy_file, tmp_path, capsys):
     (tmp_path / "s.toml").write_text("seconds = 0.1\n")
     assert deploy(["--policy", str(policy_file), "--scenario", str(tmp_path / "s.toml"), *option]) == 2
@@ -425,7 +425,7 @@ def test_what_a_scenario_says_itself_is_not_asked_for_beside_it(option, policy_f
 def test_arms_follow_a_clip_of_ones_own(policy_file, spec, tmp_path):
     clip = dataclasses.replace(shipped_library(spec).clips[0], name="mine")
     MotionLibrary([clip], spec).save(tmp_path / "own.npz")
-    own = ["--arm-motion", "mine", "--library", str(tmp_path / "own.npz")]
+    own = ["--motion", "mine", "--library", str(tmp_path / "own.npz")]
     assert deploy(["--policy", str(policy_file), "--episode-seconds", "0.1", *own]) == 0
 
 

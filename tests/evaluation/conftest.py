@@ -33,6 +33,12 @@ def save_policy(path: Path, cfg: HumanoidEnvConfig, gain: float = 1.0) -> Path:
     return path
 
 
+@pytest.fixture
+def save() -> Callable[[Path, HumanoidEnvConfig], Path]:
+    """Saves a policy for a config. Tests import nothing from here: there is a `conftest` in other folders, too."""
+    return save_policy
+
+
 @pytest.fixture(scope="session")
 def checkpoints(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     """A checkpoint by its robot's name; made once."""

@@ -47,9 +47,7 @@ def test_hands_are_loaded_as_asked(loaded):
     assert loads.ramp.share(0.0) == 1.0
 
 
-@pytest.mark.parametrize(
-    ("option", "arms"), [([], "moving"), (["--no-arm-motion"], "held"), (["--motion", "none"], "held")]
-)
+@pytest.mark.parametrize(("option", "arms"), [([], "moving"), (["--motion", "none"], "held")])
 def test_results_say_whether_arms_move(checkpoints, robot, option, arms, capsys):
     options = ("--num-envs", "2", "--episode-seconds", "6", "--threads", "1", "--hand-loads", *option)
     result = evaluate(["velocity-tracking", "--checkpoint", str(checkpoints(robot)), *options])

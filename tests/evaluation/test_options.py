@@ -10,7 +10,6 @@ from typing import Any
 import distillation_report  # noqa: F401 - that it can be loaded
 import pytest
 import torch
-from conftest import save_policy
 from publish import EVALUATIONS
 from reproduce_paper import ARMS
 
@@ -158,6 +157,9 @@ def test_a_law_reads_what_it_is_said_to_read(name, spec, rng):
         (["modulation", "--method", "facet", "--alpha-range", "0", "0.5"], "alpha_range does nothing under facet"),
         (["impact", "--speed", "1"], "speed does nothing in stance"),
         (["impact", "--place", "base", "--hand", "right"], "hand does nothing for a force on the base"),
+        (["impact", "--pelvis", "fixed", "--place", "base"], "place does nothing while the pelvis is fixed"),
+        (["constant-load", "--random-direction"], "random_direction does nothing for a force along z alone"),
+        (["velocity-tracking", "--follow-path", "--speed-x", "0.5"], "speed_x does nothing while a path is followed"),
         (["impact", "--pelvis", "fixed", "--mode", "walking"], "mode does nothing while the pelvis is fixed"),
         (["static-stiffness", "--mode", "walking"], "mode does nothing while the pelvis is fixed"),
         (["constant-load", "--library", "x.npz"], "library does nothing while arms hold a pose"),
@@ -172,10 +174,10 @@ def test_an_option_that_does_nothing_is_refused_by_name(arguments, message, caps
 
 
 @pytest.fixture
-def distilled(tmp_path) -> Path:
+def distilled(tmp_path, save) -> Path:
     """A policy of the second stage, trained under CoTaP."""
     law = UpperBodyConfig(LawConfig("cotap", null_stiffness=33.0), LawConfig("cotap", null_stiffness=33.0))
-    path = save_policy(tmp_path / "p.pt", HumanoidEnvConfig(num_envs=1, num_threads=1, upper_body=law))
+    path = save(tmp_path / "p.pt", HumanoidEnvConfig(num_envs=1, num_threads=1, upper_body=law))
     save_checkpoint(path, load_checkpoint(path) | {"kind": "distill"})
     return path
 

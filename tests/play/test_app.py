@@ -271,6 +271,9 @@ def test_what_cannot_be_shown_is_refused_before_anything_runs(free_port, tmp_pat
     for option in ("robot", "checkpoint"):
         assert main(["--port", str(free_port), "--replay", str(tmp_path / "none.npz"), f"--{option}", "h1"]) == 2
         assert "leave out --robot and --checkpoint with --replay" in capsys.readouterr().err
+    for option in ("library", "output", "seed"):
+        assert main(["--port", str(free_port), "--replay", str(tmp_path / "none.npz"), f"--{option}", "7"]) == 2
+        assert f"--{option} does nothing with --replay" in capsys.readouterr().err
     assert main(["--port", str(free_port), "--checkpoint", "policy.pt", "--robot", "h1"]) == 2
     assert "leave out --robot with --checkpoint" in capsys.readouterr().err
     assert main(["--port", str(free_port), "--robot", "made-up"]) == 2  # nobody trains it

@@ -16,7 +16,7 @@ from cotap.envs.commands import CommandSource
 from cotap.envs.scripted_forces import ForceProfile, ScriptedForces
 from cotap.evaluation.law_options import parse_law
 from cotap.inputs import InputError, read_text
-from cotap.motions.reference import ReferenceConfig, ReferenceMotion
+from cotap.motions.reference import MIXTURE, ReferenceConfig, ReferenceMotion
 from cotap.robots import RobotSpec
 
 if sys.version_info >= (3, 11):
@@ -71,7 +71,7 @@ class ArmMotion:
     pose: tuple[float, ...] = ()
     """Arm joints, left arm first [rad]."""
     clip: str = ""
-    """Name of a clip in the motion library; `random` mixes clips and generated motion as in training."""
+    """Name of a clip in the motion library; `mixture` mixes clips and generated motion as in training."""
     library: str = ""
     """Motion library (.npz) that the clip is taken from; empty for the one that comes with the package."""
 
@@ -94,7 +94,7 @@ class ArmMotion:
         """The reference of one robot. Raises MotionError for a clip that is not there."""
         cfg = ReferenceConfig()
         cfg.clips.library = self.library
-        if self.clip != "random":
+        if self.clip != MIXTURE:
             cfg.clips.share = 1.0 if self.clip else 0.0
             cfg.clips.only = (self.clip,) if self.clip else ()
         motion = ReferenceMotion(cfg, spec, 1, dt)

@@ -14,11 +14,11 @@ from cotap.compliance.laws import WITHOUT_STIFFNESS
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.scripted_forces import ForceProfile
 from cotap.evaluation.metrics import masked_mean, summaries
-from cotap.evaluation.protocol import HELD, MIXTURE
 from cotap.evaluation.report import save_figure
 from cotap.evaluation.rollout import Trajectory
 from cotap.evaluation.scenario import Scenario
 from cotap.evaluation.transient import back_within, transient_measures
+from cotap.motions.reference import HELD, MIXTURE
 
 BEFORE_S = 0.5
 """What a hand does in this time before the onset is what it is compared with afterwards [s]."""
@@ -66,6 +66,10 @@ class Impact(Scenario):
         self._profile().check()
         if self.place == "base":
             self.require_default("hand", "for a force on the base")
+        if self.pelvis == "fixed":
+            self.require_default("place", "while the pelvis is fixed")
+        if not any(self.force[:2]):
+            self.require_default("random_direction", "for a force along z alone")
 
     def _profile(self) -> ForceProfile:
         return ForceProfile(self.force, self.hand, self.onset, self.duration, 0.0, self.random_direction, self.place)

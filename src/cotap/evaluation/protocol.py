@@ -18,10 +18,7 @@ from cotap.evaluation import report
 from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.rollout import UPPER_ACTIONS, PolicyFunction, Trajectory, acting, record_rollout
 from cotap.evaluation.undisturbed import disable_disturbances
-from cotap.motions.reference import ClipConfig
-
-MIXTURE, HELD = "mixture", "none"
-"""In place of a clip's name: the mixture that the policy was trained on, and a pose that is held."""
+from cotap.motions.reference import HELD, MIXTURE, ClipConfig
 
 
 @dataclass

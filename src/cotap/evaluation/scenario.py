@@ -9,7 +9,8 @@ import torch
 
 from cotap.checks import require_one_of, require_range
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
-from cotap.evaluation.protocol import HELD, Protocol, RolloutProtocol
+from cotap.evaluation.protocol import Protocol, RolloutProtocol
+from cotap.motions.reference import HELD
 
 MODES = ("stance", "walking")
 PELVIS = ("free", "fixed")

@@ -14,7 +14,7 @@ from cotap.checks import require_one_of, require_range
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.hand_loads import HandLoadConfig
 from cotap.evaluation.metrics import summaries, tracking_measures, tracking_slopes
-from cotap.evaluation.protocol import HELD, RolloutProtocol, mirrored_pose
+from cotap.evaluation.protocol import RolloutProtocol, mirrored_pose
 from cotap.evaluation.report import plot_tracking
 from cotap.evaluation.rollout import PolicyFunction, Trajectory
 from cotap.robots.mjcf import COLLISIONS
@@ -42,18 +42,11 @@ class VelocityTracking(RolloutProtocol):
     """Share of commands that ask the robot to stand."""
     hand_loads: bool = False
     """Random loads on both hands in every episode: x and y up to 40 N, z from -50 to 5 N, held for 3 to 5 s."""
-    arm_motion: bool = True
-    """Reference arm motion; otherwise arms hold their default pose, as with `--motion none`."""
     follow_path: bool = False
     """Lead the torso along the clips' root path instead of drawing velocity commands."""
     collision: str = ""
     """feet (only feet meet the floor) or full (all shapes, each other too); empty keeps what the policy was trained
     with."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.arm_motion:
-            self.motion = (HELD,)
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
@@ -65,6 +58,9 @@ class VelocityTracking(RolloutProtocol):
             require_range(name, getattr(self, name), 0.0, 5.0)
         require_range("height_drop", self.height_drop, 0.0, 0.5)
         require_range("stand_probability", self.stand_probability, 0.0, 1.0)
+        if self.follow_path:
+            for name in ("speed_x", "speed_y", "yaw_rate", "height_drop", "stand_probability"):
+                self.require_default(name, "while a path is followed")
         if self.collision:
             require_one_of("collision", self.collision, COLLISIONS)
 

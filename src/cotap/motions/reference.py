@@ -22,6 +22,11 @@ REST = "rest"
 """The name of the motion that is none: the default pose."""
 
 
+MIXTURE, HELD = "mixture", "none"
+"""In place of a clip's name, where one is asked for: clips and generated motion as in training, and a pose that is
+held."""
+
+
 @dataclass
 class ClipConfig:
     """Real motion beside the generator's."""

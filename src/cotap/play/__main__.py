@@ -62,8 +62,9 @@ def _run(options: PlayOptions) -> int:
     begin = time.perf_counter()
     if options.replay and (options.robot or options.checkpoint):
         raise ValueError("a recording has its own robot and policies: leave out --robot and --checkpoint with --replay")
-    if options.replay and options.library:
-        raise ValueError("--library does nothing with --replay")
+    for name in ("library", "output", "seed"):
+        if options.replay and getattr(options, name) != getattr(PlayOptions, name):
+            raise ValueError(f"--{name} does nothing with --replay")
     if options.checkpoint and options.robot:
         raise ValueError("a checkpoint has its own robot: leave out --robot with --checkpoint")
     try:

@@ -16,11 +16,11 @@ from cotap.compliance.laws import LAWS, LawConfig, reads
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.scripted_forces import ForceProfile
 from cotap.evaluation.policy import Policy, load_policy
-from cotap.evaluation.protocol import MIXTURE, select_motion
+from cotap.evaluation.protocol import select_motion
 from cotap.evaluation.rollout import reference_actions
 from cotap.evaluation.undisturbed import disable_disturbances
 from cotap.motions.library import MotionError, library_sha256
-from cotap.motions.reference import REST, ClipConfig
+from cotap.motions.reference import MIXTURE, REST, ClipConfig
 from cotap.play import ROBOTS
 from cotap.play.controls import AXES, Control, Ranges, make_controls
 from cotap.play.forces import HandForces, Push
