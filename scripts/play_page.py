@@ -228,7 +228,7 @@ class Film:
             policy = default_checkpoint()
             session = Session({policy.stem: policy}, self.seed)
             app = App(server, Scene(server, session.env.spec, len(ROBOTS)), session, Path(folder))
-            server.initial_camera.position, server.initial_camera.look_at = (2.1, 1.4, 1.4), (0.0, 0.5, 0.85)
+            server.initial_camera.position, server.initial_camera.look_at = (2.1, 1.4, 1.4), (0.0, 0.1, 0.85)
             thread = threading.Thread(target=app.run, daemon=True)
             thread.start()
             try:

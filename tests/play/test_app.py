@@ -241,7 +241,7 @@ def test_the_plot_of_force_over_displacement_takes_loaded_steps_along_the_force(
     force, along = force_displacement([sample, loaded], 0, 0)
     assert force.tolist() == [20.0]
     assert along == pytest.approx([50.0], rel=1e-4)
-    assert len(Plots.TITLES) == 7
+    assert len(Plots.TITLES) == len(Plots.AXES) == 7
 
 
 def test_of_a_taken_port_the_error_says_what_to_do(free_port, capsys):
@@ -297,7 +297,9 @@ def test_a_checkpoint_brings_its_robot_and_comes_before_the_shipped_policies(ser
     assert app.session.controls["a.checkpoint"].options == (
         str(path), "shipped made-up-cotap", "shipped made-up-base",
     )  # fmt: skip
-    app.advance()
-    app.advance()
+    for _ in range(4):  # two points of each plot
+        app.advance()
     app.plots.draw(2)
+    for plot, (x, y) in zip(app.plots._sets[2], Plots.AXES, strict=True):
+        assert [axis.get("label") for axis in plot.axes or ()] == [x, y]
     app.scene.show(app._latest[1])

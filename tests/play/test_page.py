@@ -200,8 +200,9 @@ def test_a_website_cannot_use_the_page_and_a_tunnel_can(page: Page, tmp_path: Pa
     website = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
     threading.Thread(target=website.serve_forever, daemon=True).start()
     connect = """url => new Promise(done => {
-        const socket = new WebSocket(url, ["viser-v" + "0.0.0"]);
-        socket.onopen = () => done("open"); socket.onerror = () => done("refused")})"""
+        const socket = new WebSocket(url);
+        socket.onopen = () => { done("open"); socket.close() }; socket.onerror = () => done("refused")})"""
+    assert page.page.evaluate(connect, f"ws://127.0.0.1:{port}") == "open"
     stranger = page.page.context.new_page()
     stranger.goto(f"http://127.0.0.1:{website.server_port}")
     for host in ("127.0.0.1", "localhost"):
@@ -209,7 +210,7 @@ def test_a_website_cannot_use_the_page_and_a_tunnel_can(page: Page, tmp_path: Pa
     assert stranger.evaluate("url => fetch(url).then(() => 'read', () => 'refused')", f"http://127.0.0.1:{port}") == (
         "refused"
     )
-    assert len(page.app.server.get_clients()) == 1
+    page.until("one viewer", lambda: len(page.app.server.get_clients()) == 1)
     stranger.close()
     website.shutdown()
     tunnel = Tunnel(port)
@@ -218,6 +219,21 @@ def test_a_website_cannot_use_the_page_and_a_tunnel_can(page: Page, tmp_path: Pa
     through.get_by_text("control steps/s").wait_for(timeout=1000.0 * PATIENCE_S)
     page.until("a viewer through the tunnel", lambda: len(page.app.server.get_clients()) == 2)
     tunnel.close()
+
+
+def test_on_a_small_screen_nothing_lies_upon_the_robots_and_plots_are_in_sight(page: Page):
+    page.page.set_viewport_size({"width": 1000, "height": 800})
+    page.page.get_by_label("side by side").click()
+    page.until("two robots", lambda: page.app.scene.shown == 2)
+    page.page.get_by_text("B right").first.wait_for()  # the plots' legend, once they are of two robots
+    scene, head, plot = (
+        part.bounding_box()
+        for part in (page.page.locator("canvas").first, page.page.get_by_text("control steps/s"),
+                     page.page.get_by_text(page.app.plots.TITLES[0], exact=True).last)
+    )  # fmt: skip
+    assert 500.0 < scene["x"] + scene["width"] <= head["x"]
+    assert head["y"] < 200.0 < plot["y"] < 600.0
+    assert page.complaints == []
 
 
 def test_several_viewers_and_one_that_leaves_do_not_stop_it(page: Page):

@@ -17,7 +17,7 @@ from cotap.play.mailbox import Mailbox, Record, Reset, Step
 from cotap.play.notices import Notices
 from cotap.play.pace import Pace
 from cotap.play.panel import Panel
-from cotap.play.plots import Plots
+from cotap.play.plots import Plots, plots_tab
 from cotap.play.recorder import Recorder
 from cotap.play.sample import Sample
 from cotap.play.scene import Scene
@@ -187,10 +187,9 @@ class App:
             for label, on in (("Start recording", True), ("Stop and save", False)):
                 self.panel.button(label, Record(on))
             self.archive.add_buttons(gui, self.scene)
-        # Not in a tab: a plot that is made while it is hidden has no width.
-        with gui.add_folder("Plots") as folder:
+        with plots_tab(self.server) as tab:
             self._live_plots = gui.add_checkbox("live", True)
-        self.plots = Plots(self.server, folder, self.session.sides, self.session.dt)
+        self.plots = Plots(self.server, tab, self.session.sides, self.session.dt)
 
     def _add_view(self) -> None:
         gui, scene = self.server.gui, self.scene

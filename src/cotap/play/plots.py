@@ -50,6 +50,16 @@ def force_displacement(samples: list[Sample], robot: int, hand: int) -> tuple[np
     return size[on][order], along[order]
 
 
+def plots_tab(server: viser.ViserServer) -> viser.GuiTabHandle:
+    """Where plots go: a panel below that of the controls, so that both are seen at once.
+
+    It is its only tab: a plot that is made while it is hidden has no width.
+    """
+    panel = server.gui.add_panel()
+    panel.dock_below(server.gui.main_panel)
+    return panel.add_tab("Plots")
+
+
 class Plots:
     """Seven plots, made when there is something to plot.
 
@@ -60,9 +70,11 @@ class Plots:
         dt: Control step [s].
     """
 
-    TITLES = ("hand error [mm]", "arm torque [Nm]", "torso velocity [m/s]", "eigenvalues of K [Nm/rad]",
-              "energy store [J]", "share of a change of K held back",
-              "force [N] over displacement along it [mm]")  # fmt: skip
+    TITLES = ("hand error", "arm torque", "torso velocity", "eigenvalues of K", "energy store",
+              "share of a change of K held back", "force and displacement along it")  # fmt: skip
+    AXES = (("time [s]", "mm"), ("time [s]", "Nm"), ("time [s]", "m/s"), ("time [s]", "Nm/rad"), ("time [s]", "J"),
+            ("time [s]", "share"), ("mm", "N"))  # fmt: skip
+    """Labels of x and y."""
 
     def __init__(
         self, server: viser.ViserServer, container: AbstractContextManager[Any], sides: tuple[str, ...], dt: float
@@ -132,11 +144,12 @@ class Plots:
         dots = [_line(label[p], COLORS[p], dots=True) for p in pairs]
         return [
             self._gui.add_uplot(
-                points, (uplot.Series(label="mm" if series is dots else "t [s]"), *series), title=title, height=190,
-                scales={"x": uplot.Scale(time=False)}, legend=uplot.Legend(live=False),
+                points, (uplot.Series(label=x), *series), title=title, height=190,
+                axes=(uplot.Axis(label=x), uplot.Axis(label=y)), scales={"x": uplot.Scale(time=False)},
+                legend=uplot.Legend(live=False),
             )
-            for title, points, series in zip(
-                self.TITLES, lines, (hands, hands, torso, ends, hands, hands, dots), strict=True
+            for title, (x, y), points, series in zip(
+                self.TITLES, self.AXES, lines, (hands, hands, torso, ends, hands, hands, dots), strict=True
             )
         ]  # fmt: skip
 

@@ -15,7 +15,7 @@ from cotap.evaluation.recording import Recording, RecordingError
 from cotap.play.archive import Archive
 from cotap.play.controls import SPEED, Number, Refused
 from cotap.play.notices import Notices
-from cotap.play.plots import SECONDS, Plots
+from cotap.play.plots import SECONDS, Plots, plots_tab
 from cotap.play.recorder import samples_of
 from cotap.play.scene import Scene
 from cotap.robots import ROBOTS as KNOWN_ROBOTS
@@ -67,9 +67,9 @@ class Replay:
         speed.on_update(self._set_speed)
         self._time.on_update(self._seek)
         self._archive.add_buttons(gui, self.scene)
-        with gui.add_folder("Plots") as folder:
+        with plots_tab(server) as tab:
             gui.add_markdown(f"The last {SECONDS:g} s before what is shown.")
-        self._plots = Plots(server, folder, tuple(arm.side for arm in spec.arms), self._dt)
+        self._plots = Plots(server, tab, tuple(arm.side for arm in spec.arms), self._dt)
 
     def run(self) -> None:
         """Show it until `stop`, or Ctrl-C."""

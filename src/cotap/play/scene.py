@@ -113,7 +113,7 @@ class Scene:
             shadow_opacity=0.25,
         )  # fmt: skip
         self._server.initial_camera.position = (2.9, 1.5, 1.5)
-        self._server.initial_camera.look_at = (0.0, 0.35, 0.8)  # the panel covers the right
+        self._server.initial_camera.look_at = (0.0, 0.35, 0.8)  # the second robot is to the first one's right
 
     def _batch(
         self, name: str, mesh: trimesh.Trimesh, color: tuple[int, int, int], size: float, opacity: float | None = None,

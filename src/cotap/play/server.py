@@ -30,6 +30,7 @@ def open_server(host: str, port: int, token: str = "") -> viser.ViserServer:
         server.stop()
         raise PortTaken(_advice(host, port, "another program has just taken it"))
     server.gui.configure_theme(show_share_button=False, show_logo=False, control_width="large")
+    server.gui.main_panel.dock_right()  # beside the scene, not upon it
     # A browser that draws without a graphics card takes seconds to prepare an environment map, and as long for every
     # few frames with it or with shadows.
     server.scene.configure_environment_map(hdri=None)
