@@ -118,3 +118,28 @@ def test_a_line_of_help_is_cut_before_its_default():
 def test_a_name_that_resembles_nothing_gets_the_list():
     assert unknown("law", "zzz", ["pd", "cotap"]) == "unknown law 'zzz'; known: pd, cotap"
     assert len(unknown("law", "z" * 10**6, ["pd"])) < 200
+
+
+@pytest.mark.parametrize(
+    ("command", "work", "arguments"),
+    [
+        ("evaluate", "cotap.evaluate.run", ["impact"]),
+        ("export", "cotap.deployment.graph.export_policy", ["--output", "p.onnx"]),
+        ("compare", "cotap.compare.read", ["a.json", "b.json"]),
+        ("motions", "cotap.motions.__main__.describe", ["show"]),
+        ("deploy", "cotap.deploy.deploy", ["--policy", "p.onnx"]),
+        ("train", "cotap.train.train_both", []),
+        ("play", "cotap.play.__main__._run", []),
+    ],
+)
+@pytest.mark.usefixtures("in_tmp_path")
+def test_an_interrupted_command_ends_without_a_traceback(command, work, arguments, monkeypatch, capsys):
+    def interrupted(*_args, **_options):
+        raise KeyboardInterrupt
+
+    module = importlib.import_module(
+        f"cotap.{command}.__main__" if command in ("motions", "play") else f"cotap.{command}"
+    )
+    monkeypatch.setattr(work, interrupted)
+    assert module.main(arguments) == (0 if command == "play" else 130)  # which only that can end
+    assert "Traceback" not in capsys.readouterr().err

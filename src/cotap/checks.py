@@ -23,9 +23,11 @@ def quoted(value: object, longest: int = 100) -> str:
 
 
 def shortened(text: str, longest: int = 2000) -> str:
-    """A message without its middle if it is longer than that: what a file holds may be in it, whole."""
+    """A message to be printed, without its middle if it is longer than that, and without what no terminal should get:
+    what a file holds may be in it, whole."""
     half = longest // 2
-    return text if len(text) <= longest else f"{text[:half]} ... {text[-half:]}"
+    short = text if len(text) <= longest else f"{text[:half]} ... {text[-half:]}"
+    return "".join(c if c.isprintable() or c in "\n\t" else ascii(c)[1:-1] for c in short)
 
 
 def legible(text: str, longest: int = 200) -> str:

@@ -11,9 +11,12 @@ from typing import Annotated, Any
 
 import tyro
 
-from cotap.checks import is_finite, quoted, shortened
+from cotap.checks import is_finite, legible, quoted, shortened
 from cotap.files import require_output
 from cotap.inputs import InputError, read_text
+
+_MOST, _SHOWN = 1000, 100
+"""Measures that are read, and changed settings that are printed; there are some fifty of each."""
 
 
 @dataclass
@@ -31,7 +34,7 @@ class CompareOptions:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Parse, compare, report. Returns the exit status: 0, or 2 for bad input."""
+    """Parse, compare, report. Returns the exit status: 0, 2 for bad input, or 130 if interrupted."""
     options = tyro.cli(CompareOptions, args=argv, prog="python -m cotap.compare")
     try:
         from cotap.agents.checkpoint import write_json
@@ -44,6 +47,8 @@ def main(argv: list[str] | None = None) -> int:
     except (ValueError, OSError, RecursionError) as error:  # the last of settings nested without end
         print(f"error: {shortened(str(error))}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        return 130
     return 0
 
 
@@ -61,6 +66,8 @@ def read(path: str) -> dict[str, Any]:
         if not isinstance(content.get(part, {}), dict):
             raise ValueError(f"{path!r}: {part} must be an object, got {type(content[part]).__name__}")
     for part in ("metrics", "metrics_without_falls"):
+        if len(content.get(part, {})) > _MOST:
+            raise ValueError(f"{path!r}: {part} has {len(content[part])} measures; at most {_MOST} are read")
         for name, summary in content.get(part, {}).items():
             _require_summary(f"{path!r}: {part}.{name}", summary)
     if "per_env" in content:
@@ -195,9 +202,9 @@ def table(result: dict[str, Any]) -> str:
     """Differences as Markdown, then the settings that differ."""
     lines = ["| measure (better) | A | B | B - A | 95 % interval | B is |", "|---|---|---|---|---|---|"]
     for name, row in result["differences"].items():
-        shown = f"{name} ({row['better']})" if row["better"] else name
+        shown = f"{legible(name)} ({row['better']})" if row["better"] else legible(name)
         if row["difference"] is None:
-            lines.append(f"| {shown} | - | - | - | {row['reason']} | |")
+            lines.append(f"| {shown} | - | - | - | {legible(row['reason'])} | |")
             continue
         low, high = row["ci95"]
         lines.append(
@@ -206,8 +213,10 @@ def table(result: dict[str, Any]) -> str:
         )
     if pairs := [row["pairs"] for row in result["differences"].values() if "pairs" in row]:
         lines += ["", f"Compared env by env, {min(pairs)} to {max(pairs)} envs a measure."]
-    lines += ["", *(f"{name}: {old} -> {new}" for name, (old, new) in result["settings"].items())]
-    return "\n".join(lines)
+    settings = result["settings"].items()
+    changed = [f"{legible(name)}: {legible(str(old))} -> {legible(str(new))}" for name, (old, new) in settings]
+    more = [f"and {len(changed) - _SHOWN} more settings"] if len(changed) > _SHOWN else []
+    return "\n".join([*lines, "", *changed[:_SHOWN], *more])
 
 
 if __name__ == "__main__":

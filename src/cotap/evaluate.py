@@ -86,7 +86,7 @@ class RecordingOptions:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Parse, evaluate, report. Returns the exit status: 0, or 2 for bad input."""
+    """Parse, evaluate, report. Returns the exit status: 0, 2 for bad input, or 130 for one that was interrupted."""
     args = list(sys.argv[1:] if argv is None else argv)
     if not args or args[0] in ("-h", "--help"):
         print(usage())
@@ -96,6 +96,9 @@ def main(argv: list[str] | None = None) -> int:
     except (ValueError, OSError, ModuleNotFoundError) as error:
         print(f"error: {shortened(str(error))}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print("interrupted: no result", file=sys.stderr)
+        return 130
     return 0
 
 

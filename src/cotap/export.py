@@ -8,7 +8,7 @@ from pathlib import Path
 
 import tyro
 
-from cotap.checks import require_positive_int, require_seed, shortened
+from cotap.checks import require_positive_int, require_range, require_seed, shortened
 from cotap.files import require_output
 
 
@@ -28,13 +28,14 @@ class ExportOptions:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Parse, export, report. Returns the exit status: 0, 2 for bad input, 1 if the file's numbers are not torch's."""
+    """Parse, export, report. Returns the exit status: 0, 2 for bad input, 1 if the file's numbers are not torch's, or
+    130 for an export that was interrupted."""
     options = tyro.cli(ExportOptions, args=argv, prog="python -m cotap.export")
     try:
         from cotap.deployment.graph import export_policy
         from cotap.evaluation.policy import default_checkpoint, find_checkpoint
 
-        require_positive_int("checks", options.checks)
+        require_range("checks", require_positive_int("checks", options.checks), 1, 1_000_000)
         require_seed("seed", options.seed)
         output = Path(options.output)
         if output.suffix != ".onnx":
@@ -48,6 +49,9 @@ def main(argv: list[str] | None = None) -> int:
     except ArithmeticError as error:
         print(f"error: {shortened(str(error))}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:
+        print("interrupted: nothing was written", file=sys.stderr)
+        return 130
     print(f"{output}: {summary}; differs from torch by at most {worst:.1e} over {options.checks} observations")
     return 0
 

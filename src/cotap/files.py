@@ -15,8 +15,19 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     """Let `write` fill a temporary file beside `path`, then rename it: readers see the old file or the new, whole.
 
     Raises:
-        OSError: the disk is full or the folder not writable; nothing is left behind, and an old file is untouched.
+        OSError: the disk is full or the folder not writable; the error names `path`, nothing is left behind, and an old
+            file is untouched.
     """
+    try:
+        _write_beside(path, write)
+    except OSError as error:
+        if error.errno is None:  # raised by our own code, which says what it was about
+            raise
+        raise OSError(error.errno, os.strerror(error.errno), str(path)) from error
+    _sync_folder(path.parent)
+
+
+def _write_beside(path: Path, write: Callable[[Path], object]) -> None:
     handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent)
     os.close(handle)
     os.umask(mask := os.umask(0))  # the only way to read it
@@ -31,7 +42,6 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
         with contextlib.suppress(OSError):
             temporary.unlink()
         raise
-    _sync_folder(path.parent)
 
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
@@ -60,7 +70,10 @@ def require_output(option: str, path: Path | str, suffixes: tuple[str, ...] = ()
         raise ValueError(f"{option} {str(path)!r} is a folder, not a file")
     if suffixes and target.suffix.lower() not in suffixes:
         raise ValueError(f"{option} must end in {' or '.join(suffixes)}, got {str(path)!r}")
-    handle, name = tempfile.mkstemp(prefix=".writable.", dir=target.resolve().parent)
+    try:
+        handle, name = tempfile.mkstemp(prefix=".writable.", dir=target.resolve().parent)
+    except OSError as error:
+        raise OSError(error.errno, f"{option}: {error.strerror}", str(path)) from error
     os.close(handle)
     os.unlink(name)
 

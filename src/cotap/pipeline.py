@@ -7,11 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from cotap.agents.checkpoint import STAGES
 from cotap.checks import require_positive_int, require_range
 from cotap.configs import BASE_RECIPES, DISTILL_RECIPES, BaseTraining, DistillTraining
 from cotap.sim import resolve_backend
-
-STAGES = ("base", "distill")
 
 RunStage = Callable[[str, list[str]], Path]
 """Trains one stage, given its name and its arguments as if typed, and returns its directory."""

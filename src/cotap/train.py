@@ -16,6 +16,7 @@ from typing import Annotated, Any
 import tyro
 
 from cotap import __version__
+from cotap.agents.checkpoint import STAGES
 from cotap.checks import quoted, reason_of, require_one_of, shortened
 from cotap.configs import (
     BASE_RECIPES,
@@ -26,7 +27,7 @@ from cotap.configs import (
     from_plain,
     to_plain,
 )
-from cotap.pipeline import STAGES, PipelineOptions, Stopped, next_commands, train_both
+from cotap.pipeline import PipelineOptions, Stopped, next_commands, train_both
 from cotap.sim import resolve_backend
 
 SHORTCUTS = {

@@ -231,7 +231,7 @@ def test_files_that_are_no_policy_are_refused_by_name(change, message, policy_fi
     ("name", "value", "message"),
     [
         ("robot", 3, "metadata robot must be a text, got 3"),
-        ("stage", None, "metadata stage must be a text"),
+        ("stage", None, "metadata stage None is unknown; known: base, distill"),
         ("joints", ["a"] * 19, "metadata joints must be a list of different names"),
         ("joints", {"a": 1}, "metadata joints must be a list of different names"),
         ("kp", 100.0, "metadata kp must be a list"),

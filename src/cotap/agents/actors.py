@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, cast
 
 import torch
@@ -11,6 +12,8 @@ from tensordict import TensorDict
 from torch import nn
 
 from cotap.agents.heads import Head, SymmetricHead
+from cotap.checks import quoted
+from cotap.memory import require_memory
 from cotap.reflection import Reflection, Symmetry, join
 
 Observations = dict[str, torch.Tensor]
@@ -60,12 +63,24 @@ class AgentLayout:
         """Input width of the `actor` or the `critic`."""
         return sum(self.observation_widths[g] for g in self.obs_groups[reader])
 
+    def num_weights(self, hidden: tuple[int, ...]) -> int:
+        """Weights of all networks with these hidden layers, without biases and output layers; symmetric ones keep
+        half."""
+        inputs = [(self.width(reader), *hidden) for reader in ("actor", "critic")]
+        weights = sum(a * b for widths in inputs for a, b in pairwise(widths))
+        return len(self.action_slices) * weights // (2 if self.symmetry else 1)
+
 
 class DualActorCritic(nn.Module):
-    """Actors and critics of all agents. The joint policy is the product of the agents' diagonal Gaussians."""
+    """Actors and critics of all agents. The joint policy is the product of the agents' diagonal Gaussians.
+
+    Raises:
+        ValueError: there is no memory for them.
+    """
 
     def __init__(self, layout: AgentLayout, hidden: tuple[int, ...], initial_std: float) -> None:
         super().__init__()
+        require_memory(f"ppo.hidden {quoted(hidden)}", 4 * layout.num_weights(hidden))
         self.layout = layout
         used = {g for groups in layout.obs_groups.values() for g in groups}
         self.normalizers = nn.ModuleDict(

@@ -27,6 +27,8 @@ PARTS: dict[str, Any] = {
     "iteration": int, "samples": int, "wall_seconds": (int, float), "rng": torch.Tensor, "device_rng": torch.Tensor,
 }  # fmt: skip
 """What a checkpoint of a run holds; the parts of a shipped one may be empty."""
+STAGES = ("base", "distill")
+"""Of training; what the part `kind` may be."""
 OPTIONAL_PARTS = {"device_rng"}
 """What some checkpoints lack: random numbers of a GPU, if networks were on none."""
 MALFORMED = (RuntimeError, ValueError, TypeError, LookupError, AttributeError, OverflowError)
@@ -169,6 +171,8 @@ def require_parts(path: Path | str, content: dict[str, Any], parts: Collection[s
                 continue
             raise CheckpointError(f"checkpoint {str(path)!r} lacks its part {part!r}")
         value = content[part]
+        if part == "kind" and not any(same(value, stage) for stage in STAGES):
+            raise CheckpointError(f"checkpoint {str(path)!r} is of stage {quoted(value)}; known: {', '.join(STAGES)}")
         if not isinstance(value, PARTS[part]) or (isinstance(value, (int, float)) and not value >= 0):
             raise CheckpointError(f"checkpoint {str(path)!r} has no usable part {part!r}: {quoted(value)}")
 

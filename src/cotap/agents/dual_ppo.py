@@ -23,7 +23,8 @@ from cotap.agents.losses import (
 )
 from cotap.agents.precision import PRECISIONS, resolve_precision
 from cotap.agents.ranks import Ranks
-from cotap.checks import require_one_of, require_positive_int, require_range, require_shape
+from cotap.checks import quoted, require_one_of, require_positive_int, require_range, require_shape
+from cotap.memory import require_memory
 
 
 @dataclass
@@ -156,6 +157,10 @@ class DualPPO:
         if total < 2:  # advantages are scaled by their spread, which one sample does not have
             raise ValueError(f"num_envs * steps must be at least 2, got {total}")
         t, n, g, a = cfg.steps, num_envs, len(self.names), layout.num_actions
+        seen = self.dtype.itemsize * sum(layout.observation_widths[k] for k in self.model.normalizers)
+        own = 4 * ((3 if guide else 2) * a + 5 * g)
+        shown = f"ppo.steps {quoted(t)} of {quoted(n)} envs"
+        require_memory(shown, t * n * (seen + own), device)
 
         def buffer(width: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
             return torch.zeros(t, n, width, dtype=dtype, device=device)

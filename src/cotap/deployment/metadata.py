@@ -11,6 +11,7 @@ from cotap.checks import is_finite, legible, quoted, reason_of, require_one_of, 
 
 FORMAT = "cotap-policy-3"
 INPUT, TARGETS = "observation", "joint_targets"
+STAGES = ("base", "distill")
 UPPER_MODES = ("residual", "absolute")
 PER_JOINT = ("default_pose_rad", "kp", "kd", "torque_limit_nm")
 
@@ -102,7 +103,8 @@ def read_metadata(where: str, properties: Mapping[str, str]) -> PolicyMetadata:
 def _check(m: PolicyMetadata) -> None:
     if m.format != FORMAT:
         raise ValueError(f"format is {quoted(m.format)}; this cotap reads {FORMAT!r}")
-    for name in ("robot", "stage", "checkpoint_sha256", "cotap_version"):
+    require_one_of("metadata stage", m.stage, STAGES)
+    for name in ("robot", "checkpoint_sha256", "cotap_version"):
         _require(isinstance(getattr(m, name), str), name, "a text", getattr(m, name))
     for name in ("action", "observation", "gait", "commands", "terminations", "law", "golden"):
         _require(isinstance(getattr(m, name), dict), name, "an object", getattr(m, name))

@@ -77,7 +77,7 @@ class HumanoidEnvConfig:
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
         require_positive_int("num_envs", self.num_envs)
-        require_positive_int("substeps", self.substeps)
+        require_range("substeps", require_positive_int("substeps", self.substeps), 1, 1000)
         require_seed("seed", self.seed)
         require_one_of("robot", self.robot, ROBOTS.keys())
         resolve_backend(self.backend)

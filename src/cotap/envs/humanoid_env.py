@@ -10,7 +10,7 @@ import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
-from cotap.checks import require_all_finite, require_positive_int, require_seed, require_shape
+from cotap.checks import quoted, require_all_finite, require_positive_int, require_seed, require_shape
 from cotap.compliance.laws import LawConfig
 from cotap.envs.actions import JointTargets
 from cotap.envs.actuation import Actuation
@@ -28,11 +28,16 @@ from cotap.envs.start import start_state
 from cotap.envs.state import RobotState, StateReader
 from cotap.envs.terminations import diverged, fallen
 from cotap.envs.upper_body import UpperBody
+from cotap.memory import require_memory
 from cotap.motions.reference import ReferenceMotion
 from cotap.reflection import Symmetry
 from cotap.robots import ROBOTS
 from cotap.robots.mjcf import build_model, torso_inertia
-from cotap.sim import make_simulation
+from cotap.sim import make_simulation, simulated_on
+
+BYTES_PER_JOINT = 1100
+"""Memory that an env takes for each joint of its robot: measured on mjbatch, without contacts, so that it is never
+less."""
 
 
 class HumanoidEnv(VecEnv):
@@ -51,7 +56,7 @@ class HumanoidEnv(VecEnv):
         processes: How many learn as one, each with as many envs: `samples`, and what follows them, counts all.
 
     Raises:
-        ValueError: a field of the config is out of its range.
+        ValueError: a field of the config is out of its range, or there is no memory for so many envs.
     """
 
     cfg: HumanoidEnvConfig  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -65,6 +70,8 @@ class HumanoidEnv(VecEnv):
         self.spec = spec = ROBOTS[cfg.robot]()
         self.num_actions, self.num_lower = len(spec.joints), len(spec.lower_joints)
         self.action_slices = {"lower": slice(0, self.num_lower), "upper": slice(self.num_lower, self.num_actions)}
+        needed = BYTES_PER_JOINT * len(spec.joints) * cfg.num_envs
+        require_memory(f"num_envs {quoted(cfg.num_envs)}", needed, simulated_on(cfg.backend))
         model = build_model(spec, cfg.collision, cfg.control_dt / cfg.substeps, cfg.fixed_base, cfg.unevenness_m)
         model.actuator_forcerange[:] *= cfg.torque_limit_scale
         self.sim = make_simulation(cfg.backend, model, self.num_envs, cfg.substeps, cfg.num_threads, Randomizer.FIELDS)

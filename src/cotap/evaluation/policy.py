@@ -12,7 +12,7 @@ import torch
 
 from cotap.agents.actors import AgentLayout, DualActorCritic
 from cotap.agents.checkpoint import MALFORMED, CheckpointError, load_checkpoint, load_weights, require_parts
-from cotap.checks import reason_of, require_one_of, require_positive_int
+from cotap.checks import quoted, reason_of, require_one_of, require_positive_int
 from cotap.configs import from_plain
 from cotap.envs import HumanoidEnvConfig
 
@@ -89,6 +89,8 @@ def load_policy(path: Path | str) -> Policy:
         hidden = tuple(require_positive_int(f"ppo.hidden[{i}]", width) for i, width in enumerate(widths))
         networks = AgentLayout.from_plain(agents)
         _require_fitting(networks, layout)
+        if networks.num_weights(hidden) > sum(value.numel() for value in weights.values()):
+            raise ValueError(f"ppo.hidden {quoted(hidden)} takes more weights than there are")
         model = DualActorCritic(networks, hidden, 1.0)
         load_weights(model, weights)
     except MALFORMED as error:

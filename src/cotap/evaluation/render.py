@@ -166,15 +166,34 @@ def write_film(path: Path, frames: Iterator[np.ndarray], count: int, dt: float, 
 
 
 def write_video(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
-    """Write frames as MP4, atomically."""
+    """Write frames as MP4, atomically. Raises OSError if it cannot be written."""
     import imageio.v2 as imageio
 
     def write(temporary: Path) -> None:
         with imageio.get_writer(temporary, format="FFMPEG", fps=fps, macro_block_size=8, quality=7) as writer:  # pyright: ignore
             for frame in frames:
                 writer.append_data(frame)
+        if "moov" not in mp4_boxes(temporary):  # ffmpeg is another program, and imageio does not say that it failed
+            raise OSError(f"cannot write film {path}: ffmpeg did not finish it (disk full?)")
 
     write_atomically(path, write)
+
+
+def mp4_boxes(path: Path) -> list[str]:
+    """The parts of a file as MP4 names them, as far as they are whole; a film that can be played has a `moov`."""
+    names, left = [], path.stat().st_size
+    with path.open("rb") as file:
+        while len(head := file.read(8)) == 8:
+            size = int.from_bytes(head[:4], "big")
+            read = 8
+            if size == 1:  # a longer one
+                size, read = int.from_bytes(file.read(8), "big"), 16
+            if size < read or size > left:
+                break
+            names.append(head[4:].decode("latin-1"))
+            file.seek(size - read, 1)
+            left -= size
+    return names
 
 
 def contact_sheet(path: Path, frames: list[np.ndarray], columns: int) -> None:

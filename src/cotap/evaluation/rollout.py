@@ -14,6 +14,7 @@ from cotap.compliance.dynamics import gravity_torque
 from cotap.compliance.interface import Arms
 from cotap.envs import HumanoidEnv
 from cotap.envs.state import RobotState
+from cotap.memory import require_memory
 from cotap.rotations import rotate_inverse
 
 PolicyFunction = Callable[[dict[str, torch.Tensor]], torch.Tensor]
@@ -86,6 +87,9 @@ def record_rollout(
         steps: Number of control steps.
         progress: Whether to show a progress bar.
         before_step: Called before every step with the environment and the step's number: commands, parameters of laws.
+
+    Raises:
+        ValueError: there is no memory for the record, and for measures of it, which take as much again.
     """
     obs = env.reset()
     record: dict[str, torch.Tensor] = {}
@@ -94,7 +98,11 @@ def record_rollout(
         if before_step:
             before_step(env, step)
         obs, _, _, extras = env.step(policy(as_dict(obs, env.device)))
-        for name, value in trajectory_row(env, extras["falls"]).items():
+        row = trajectory_row(env, extras["falls"])
+        if step == 0:
+            needed = 2 * steps * sum(value.numel() * value.element_size() for value in row.values())
+            require_memory(f"a record of {steps} steps of {env.num_envs} envs", needed)
+        for name, value in row.items():
             record.setdefault(name, value.new_empty((steps, *value.shape)))[step] = value
         frames.append(picture_row(env))
     return Trajectory(

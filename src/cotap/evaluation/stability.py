@@ -57,7 +57,7 @@ class Stability(Protocol):
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
         super().check()
-        require_positive_int("poses", self.poses)
+        require_range("poses", require_positive_int("poses", self.poses), 1, 1_000_000)
         require_range("num_envs", self.num_envs, 2, 1_000_000)
         for i, wall in enumerate(self.walls):
             require_range(f"walls[{i}]", wall, 0.0, 1e7)

@@ -75,13 +75,16 @@ def _show(options: argparse.Namespace) -> int:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Parse and run. Returns the exit status: 0, or 2 for what the user can correct."""
+    """Parse and run. Returns the exit status: 0, 2 for what the user can correct, or 130 if interrupted."""
     options = make_parser().parse_args(arguments)
     try:
         return {"import": _import, "show": _show}[options.command](options)
     except (ValueError, OSError) as error:
         print(f"error: {shortened(str(error))}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Batched physics: stepping, per-env model fields, wrenches, snapshots; knows nothing of control laws."""
 
-from cotap.sim.backends import BACKENDS, make_simulation, resolve_backend
+from cotap.sim.backends import BACKENDS, make_simulation, resolve_backend, simulated_on
 from cotap.sim.batch_simulation import BatchSimulation
 from cotap.sim.simulation import Simulation, Snapshot
 
@@ -11,4 +11,5 @@ __all__ = [
     "Snapshot",
     "make_simulation",
     "resolve_backend",
+    "simulated_on",
 ]

@@ -33,6 +33,11 @@ def resolve_backend(name: str) -> str:
     return "mjbatch" if missing else "warp"
 
 
+def simulated_on(backend: str) -> str:
+    """The device, cpu or cuda, that a backend keeps its envs on. Raises ValueError as `resolve_backend` does."""
+    return "cuda" if resolve_backend(backend) == "warp" and torch.cuda.is_available() else "cpu"
+
+
 def make_simulation(
     backend: str, model: mujoco.MjModel, num_envs: int, substeps: int, num_threads: int = 0,
     fields: tuple[str, ...] = (),
@@ -46,5 +51,4 @@ def make_simulation(
         return BatchSimulation(model, num_envs, substeps, num_threads, fields)
     from cotap.sim.warp_simulation import WarpSimulation  # an optional extra
 
-    device = "cuda" if torch.cuda.is_available() else "cpu"
-    return WarpSimulation(model, num_envs, substeps, device, fields)
+    return WarpSimulation(model, num_envs, substeps, simulated_on(backend), fields)

@@ -65,7 +65,7 @@ class Tour(Protocol):
         if self.engine != "mujoco":
             self.require_default("randomize", f"in {self.engine}")
         require_one_of("upper_actions", self.upper_actions, UPPER_ACTIONS)
-        require_positive_int("waypoints", self.waypoints)
+        require_range("waypoints", require_positive_int("waypoints", self.waypoints), 1, 10_000)
         require_range("episode_seconds", self.episode_seconds, CONTROL_S, 3600.0)
         if abs(self.segment_s - CONTROL_S * self.segment_steps) > 1e-6:
             raise ValueError(
