@@ -1,13 +1,14 @@
-"""Policies that come with the package: where they come from, and that they still do what was measured."""
+"""Policies that come with the package: where they come from, and that they still do what was measured, all of it."""
 
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import fields
 from typing import Any
 
 import pytest
-from publish import EVALUATIONS
+from publish import ENVS, EVALUATIONS
 
 from cotap.agents.checkpoint import load_checkpoint, sha256
 from cotap.configs import from_plain
@@ -47,6 +48,39 @@ def test_a_shipped_evaluation_can_be_asked_for_again(name: str):
 def own(kind: type, settings: dict[str, Any]) -> dict[str, Any]:
     """Of all settings, those of one dataclass."""
     return {f.name: settings[f.name] for f in fields(kind) if f.name in settings}
+
+
+def uncertainty(summary: dict[str, Any]) -> float:
+    """Standard error of a mean; of a share by its interval, which has a width even where all envs agree."""
+    low, high = summary["ci95"]
+    return max(summary["std"] / math.sqrt(summary["n"]), (high - low) / 3.92)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("evaluation", EVALUATIONS)
+@pytest.mark.parametrize("name", shipped_names())
+def test_a_shipped_evaluation_is_what_the_policy_does(name: str, evaluation: str):
+    """Asked for again with 64 other envs: nothing differs by five standard errors, and settings are those it says."""
+    path = shipped_checkpoint(name)
+    kept = json.loads(path.with_name(f"{name}.{evaluation}.json").read_text())
+    assert kept["settings"]["checkpoint_sha256"] == sha256(path)
+    args = ["64" if arg == ENVS else arg for arg in EVALUATIONS[evaluation]]
+    now = evaluate([*args, "--checkpoint", str(path), "--seed", "1", "--threads", "1"])
+    changed = {"seed", "num_envs", "checkpoint_sha256", "env"}
+    settings = [{k: v for k, v in result["settings"].items() if k not in changed} for result in (kept, now)]
+    assert json.loads(json.dumps(settings[1])) == settings[0]
+    compared = 0
+    for measure, before in kept["metrics"].items():
+        after = now["metrics"][measure]
+        if min(before["n"], after["n"]) < 20:  # such as the time that those take to recover who leave their place
+            assert before["n"] < 20 * 16 or after["n"] > 0, measure
+            continue
+        error = math.hypot(uncertainty(before), uncertainty(after))
+        assert abs(after["mean"] - before["mean"]) <= 5.0 * error + 1e-9, measure
+        compared += 1
+    assert compared >= 10
+    for axis, slope in kept.get("slopes", {}).items():
+        assert now["slopes"][axis] == pytest.approx(slope, abs=0.1), axis
 
 
 @pytest.mark.parametrize("name", shipped_names())
