@@ -19,6 +19,7 @@ from cotap.evaluation.fall_curve import FallCurve
 from cotap.evaluation.fidelity import Fidelity
 from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.modulation import Modulation
+from cotap.evaluation.passivity import Passivity
 from cotap.evaluation.periodic import PeriodicLoad
 from cotap.evaluation.protocol import Protocol, RolloutProtocol
 from cotap.evaluation.recording import RecordingProtocol
@@ -41,6 +42,7 @@ PROTOCOLS: dict[str, type[Protocol]] = {
     "velocity-tracking": VelocityTracking,
     "static-stiffness": StaticStiffness,
     "stability": Stability,
+    "passivity": Passivity,
     "fidelity": Fidelity,
     "impact": Impact,
     "constant-load": ConstantLoad,

@@ -34,6 +34,7 @@ OTHERWISE: dict[str, dict[str, Any]] = {
     "static-stiffness": {"pelvis": "fixed", "upper_actions": "reference", "randomize": False},
     "fidelity": {"randomize": False},
     "stability": {"randomize": False},
+    "passivity": {"pelvis": "fixed", "upper_actions": "reference", "randomize": False},
     "periodic-load": {"hand": "both"},
     "tour": {"upper_actions": "reference", "randomize": False},
 }
@@ -41,6 +42,7 @@ OTHERWISE: dict[str, dict[str, Any]] = {
 WITHOUT: dict[str, set[str]] = {
     "velocity-tracking": {*ON_LEGS, "hand"},  # draws its commands; loads both hands
     "stability": {*ON_LEGS, *OF_ARMS},  # a law alone, in the air, at random poses, both hands loaded
+    "passivity": {"library", "arm_pose", "hand"},  # draws its poses; pulls the left hand
     "static-stiffness": {"library"},  # holds one pose
     "fidelity": {"arm_pose"},  # draws its poses from a library
     "tour": {*ON_LEGS, "arm_pose", "library", "hand"},  # walks, its arms wander, any joint is struck
@@ -195,7 +197,12 @@ def test_the_law_of_the_training_is_the_default_of_every_evaluation(protocol, di
         assert softer.left.stiffness == softer.right.stiffness == (500.0,) * 3
     # A policy of the first stage has PD, or the law that the protocol is about.
     own = arms_of(parse([protocol]), load_policy(checkpoint))
-    named = {"fidelity": ("cotap", "cotap"), "modulation": ("cotap", "cotap"), "periodic-load": ("cotap", "pd")}
+    named = {
+        "fidelity": ("cotap", "cotap"),
+        "modulation": ("cotap", "cotap"),
+        "passivity": ("cotap", "cotap"),
+        "periodic-load": ("cotap", "pd"),
+    }
     assert (own.left.name, own.right.name) == named.get(protocol, ("pd", "pd"))
     assert arms_of(parse(["periodic-load", "--method", "cotap"]), load_policy(checkpoint)).left == LawConfig("cotap")
 
