@@ -88,7 +88,7 @@ def hold_base(mj: mujoco.MjSpec, spec: RobotSpec) -> None:
     """Weld the base to the world; stiffly, since what hangs from it is measured to a tenth of a millimetre."""
     weld = mj.add_equality(name="fixed_base", type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY)
     weld.name1, weld.name2 = spec.base_body, "world"
-    weld.data[:] = [0.0, 0.0, 0.0, 0.0, 0.0, -(spec.base_height_m + FIXED_BASE_LIFT_M), 1.0, 0.0, 0.0, 0.0, 1.0]
+    weld.data[:11] = [0.0, 0.0, 0.0, 0.0, 0.0, -(spec.base_height_m + FIXED_BASE_LIFT_M), 1.0, 0.0, 0.0, 0.0, 1.0]
     weld.solimp[:3] = 0.9999, 0.9999, 0.001
 
 
