@@ -301,7 +301,7 @@ class Properties:
             (soft, stiff, right), at = self._moved(name, (0.5 * k, 2.0 * k, k))
             (wrong,), misled = self._moved(name, (k,), wrong=True)
             arms = laws_of(name, self.stiffness, self.null_stiffness).configure()
-            cfg = self.stability.configure(HumanoidEnvConfig(backend="mjbatch", num_threads=self.threads))
+            cfg = self.stability.configure(HumanoidEnvConfig(backend="mujoco", num_threads=self.threads))
             cfg.upper_body = arms
             rows[name] = {
                 "softer_over_stiffer": soft / stiff,
@@ -319,7 +319,7 @@ class Properties:
         Pelvis fixed; the stiffness of the hand without a load is the last.
         """
         protocol = StaticStiffness(num_envs=1 + len(stiffness), levels=2, settle_seconds=self.settle_seconds)
-        cfg = protocol.configure(HumanoidEnvConfig(backend="mjbatch", num_threads=self.threads))
+        cfg = protocol.configure(HumanoidEnvConfig(backend="mujoco", num_threads=self.threads))
         cfg.upper_body = laws_of(name, stiffness[-1], self.null_stiffness).configure()
         env = HumanoidEnv(cfg)
         if wrong:

@@ -17,7 +17,7 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from cotap.envs import humanoid_env
-from cotap.sim import BatchSimulation, Simulation
+from cotap.sim import BatchSimulation, Simulation, batch_of
 
 DEVICE = "meta"
 """A kind that every torch knows by name; that its tensors hold nothing is of no account here."""
@@ -125,10 +125,10 @@ def _autocast(device_type: str, *args: Any, **kwargs: Any) -> Any:
 
 
 class _Simulation(BatchSimulation):
-    """mjbatch's envs, seen as tensors on `DEVICE` that share its memory."""
+    """MuJoCo's envs, seen as tensors on `DEVICE` that share its memory."""
 
     def __init__(self, *args: Any) -> None:
-        super().__init__(*args)
+        super().__init__(batch_of("mujoco"), *args)
         self.device = DEVICE
         for name in ("qpos", "qvel", "ctrl", "xfrc", "sensors"):
             setattr(self, name, Elsewhere(getattr(self, name)))

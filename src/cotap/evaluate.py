@@ -65,8 +65,9 @@ class Options(Generic[P]):
     """Checkpoint to evaluate, a file or the name of a shipped one. By default the shipped base policy for
     velocity-tracking, and for all others the shipped policy that was distilled under compliance, if there is one."""
     backend: str = "auto"
-    """What simulates: mjbatch (the CPU), warp (a GPU), or auto: warp where there are a GPU and the extra `warp`.
-    Results are reproducible on one machine, on GPUs up to rounding."""
+    """What simulates: mujoco or mjbatch (the CPU), warp (a GPU), or auto: warp where there are a GPU and the extra
+    `warp`, else mjbatch where it is installed, else mujoco. Results are reproducible on one machine, on GPUs up to
+    rounding."""
     threads: int = 0
     """Threads; 0 takes every core. Results are reproducible for one number."""
     json: str = ""

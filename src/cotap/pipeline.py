@@ -40,8 +40,8 @@ class PipelineOptions:
     threads: int = 0
     """CPU threads; 0 takes every core."""
     backend: str = "auto"
-    """What simulates, in all stages: mjbatch (the CPU), warp (a GPU), or auto: warp where there is one
-    and the extra `warp`."""
+    """What simulates, in all stages: mujoco or mjbatch (the CPU), warp (a GPU), or auto: warp where there is one
+    and the extra `warp`, else mjbatch where it is installed, else mujoco."""
     device: str = "cpu"
     """Where the networks live, in all stages."""
 

@@ -9,14 +9,14 @@ import torch
 from env_tools import mujoco_of
 
 from cotap.envs.randomization import RandomizationConfig, Randomizer
-from cotap.sim import BatchSimulation
+from cotap.sim import Simulation, make_simulation
 
 N = 200
 
 
 @pytest.fixture
-def sim(any_model) -> BatchSimulation:
-    return BatchSimulation(any_model, N, 2, 1, Randomizer.FIELDS)
+def sim(any_model) -> Simulation:
+    return make_simulation("mujoco", any_model, N, 2, 1, Randomizer.FIELDS)
 
 
 @pytest.fixture

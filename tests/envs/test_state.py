@@ -15,7 +15,7 @@ import torch
 from robots.joints import called
 
 from cotap.envs.state import StateReader
-from cotap.sim import BatchSimulation
+from cotap.sim import make_simulation
 
 N = 12
 
@@ -25,7 +25,7 @@ def read(any_spec, any_model):
     """A state and the single robots that it must agree with."""
     model = any_model
     rng = torch.Generator().manual_seed(3)
-    sim = BatchSimulation(model, N, 2, 1)
+    sim = make_simulation("mujoco", model, N, 2, 1)
     qpos = torch.zeros(N, model.nq, dtype=torch.float64)
     qpos[:, :3] = torch.randn(N, 3, generator=rng)
     qpos[:, 3:7] = torch.nn.functional.normalize(torch.randn(N, 4, generator=rng), dim=1)
@@ -118,7 +118,7 @@ def test_feet(read, any_spec, any_model):
 def test_foot_force_and_contact(any_spec, any_model):
     """One foot on the floor carries the load that MuJoCo's contacts report; the other, lifted, none."""
     spec, model = any_spec, any_model
-    sim = BatchSimulation(model, 1, 2, 1)
+    sim = make_simulation("mujoco", model, 1, 2, 1)
     qpos = torch.zeros(1, model.nq)
     qpos[0, 2], qpos[0, 3] = spec.base_height_m - 0.003, 1.0
     qpos[0, 7:] = torch.tensor([j.default_rad for j in spec.joints])
@@ -140,7 +140,7 @@ def test_foot_force_and_contact(any_spec, any_model):
 
 def test_reading_some_is_reading_all(any_spec, any_model):
     """A state in which envs are replaced is the one that is read whole."""
-    sim = BatchSimulation(any_model, 5, 2, 1)
+    sim = make_simulation("mujoco", any_model, 5, 2, 1)
     everyone = torch.ones(5, dtype=torch.bool)
     rng = torch.Generator().manual_seed(4)
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import importlib.util
+import subprocess
 import sys
+from importlib.metadata import PackageNotFoundError
 
+import mujoco
 import pytest
 import torch
 from random_policy import save_random_policy
@@ -17,29 +20,59 @@ from cotap.train import main as train
 
 @pytest.fixture
 def machine(monkeypatch):
-    """Pretends that there is a graphics card, or the extra, or not."""
+    """Pretends that there is a graphics card, or the extra `warp`, or mjbatch and the MuJoCo that it pins, or not."""
 
-    def pretend(card: bool, extra: bool) -> None:
+    def pretend(card: bool, warp: bool, mjbatch: bool = True, pin: str = mujoco.__version__) -> None:
+        def requires(_: str) -> list[str]:
+            if not mjbatch:
+                raise PackageNotFoundError
+            return [f"mujoco=={pin}", "numpy"]
+
         monkeypatch.setattr(torch.cuda, "is_available", lambda: card)
-        monkeypatch.setattr(backends, "find_spec", lambda _: object() if extra else None)
+        monkeypatch.setattr(backends, "find_spec", lambda _: object() if warp else None)
+        monkeypatch.setattr(backends, "requires", requires)
 
     return pretend
 
 
 @pytest.mark.parametrize(
-    ("card", "extra", "means"),
-    [(True, True, "warp"), (True, False, "mjbatch"), (False, True, "mjbatch"), (False, False, "mjbatch")],
+    ("card", "warp", "mjbatch", "means"),
+    [
+        (True, True, True, "warp"),
+        (True, True, False, "warp"),
+        (True, False, True, "mjbatch"),
+        (False, True, True, "mjbatch"),
+        (False, False, True, "mjbatch"),
+        (True, False, False, "mujoco"),
+        (False, True, False, "mujoco"),
+    ],
 )
-def test_auto_is_warp_where_a_card_and_the_extra_are(machine, card, extra, means):
-    machine(card, extra)
+def test_auto_is_the_fastest_that_can_be_had(machine, card, warp, mjbatch, means):
+    machine(card, warp, mjbatch)
     assert resolve_backend("auto") == means
 
 
 @pytest.mark.parametrize("card", [True, False])
 def test_a_backend_that_is_named_is_taken(machine, card):
     machine(card, True)
-    assert resolve_backend("warp") == "warp"
-    assert resolve_backend("mjbatch") == "mjbatch"
+    for name in ("warp", "mjbatch", "mujoco"):
+        assert resolve_backend(name) == name
+
+
+def test_mjbatch_is_used_beside_its_own_mujoco_alone(machine):
+    """With another MuJoCo, its compiled part would read memory that is laid out otherwise."""
+    machine(False, False, pin="2.0.0")
+    assert resolve_backend("auto") == "mujoco"
+    with pytest.raises(ValueError, match=rf"needs mujoco==2.0.0, and mujoco=={mujoco.__version__} is installed"):
+        resolve_backend("mjbatch")
+
+
+def test_mjbatch_that_is_not_installed_is_named(machine, capsys):
+    machine(False, False, mjbatch=False)
+    with pytest.raises(ValueError, match=r"backend 'mjbatch' needs mjbatch, .* pip install cotap\[mjbatch\]"):
+        HumanoidEnv(HumanoidEnvConfig(num_envs=1, backend="mjbatch"))
+    assert train(["base", "--backend", "mjbatch", "--num-envs", "2"]) == 2
+    assert "pip install cotap[mjbatch]" in capsys.readouterr().err
 
 
 def test_warp_that_is_not_installed_is_named(machine, capsys, tmp_path):
@@ -65,10 +98,16 @@ def test_unknown_backends_are_refused(capsys):
     assert "'wrap' is unknown" in capsys.readouterr().err
 
 
-def test_mjbatch_needs_nothing_of_warp(model, monkeypatch):
-    monkeypatch.setitem(sys.modules, "mujoco_warp", None)
-    monkeypatch.setitem(sys.modules, "warp", None)
-    assert isinstance(make_simulation("mjbatch", model, 2, 2, 1), BatchSimulation)
+def test_mujoco_needs_nothing_of_mjbatch_and_warp(model, monkeypatch):
+    for name in ("mjbatch", "mujoco_warp", "warp"):
+        monkeypatch.setitem(sys.modules, name, None)
+    assert isinstance(make_simulation("mujoco", model, 2, 2, 1), BatchSimulation)
+
+
+def test_importing_cotap_loads_neither_mjbatch_nor_warp():
+    code = "import sys, cotap.envs, cotap.train; print({'mjbatch', 'mujoco_warp', 'warp'} & {*sys.modules})"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.stdout.strip() == "set()", done.stderr[-800:]
 
 
 @pytest.mark.skipif(importlib.util.find_spec("mujoco_warp") is None, reason="needs the extra warp")

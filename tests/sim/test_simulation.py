@@ -1,4 +1,4 @@
-"""The batch against single MuJoCo envs and hand-worked numbers."""
+"""Every batch on the CPU against single MuJoCo envs and hand-worked numbers."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from batches import BATCHES, batch_named
 
 from cotap.sim import BatchSimulation
 
@@ -16,9 +17,17 @@ FREE_BODY = """
 """
 
 
+FIELDS = ("body_mass", "body_inertia", "geom_friction")
+
+
+@pytest.fixture(params=BATCHES)
+def batch(request):
+    return batch_named(request.param)
+
+
 @pytest.fixture
-def sim(model) -> BatchSimulation:
-    return BatchSimulation(model, N, substeps=2, num_threads=1, fields=("body_mass", "body_inertia", "geom_friction"))
+def sim(model, batch) -> BatchSimulation:
+    return BatchSimulation(batch, model, N, 2, 1, FIELDS)
 
 
 def start(model, height=2.0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -68,6 +77,7 @@ def test_masked_reset_touches_only_its_envs(sim, model):
     for _ in range(3):
         sim.step(no_drive(sim))
     before = sim.snapshot()
+    sim.xfrc[1, 1, 1], sim.ctrl[1, 0] = 20.0, 5.0
     mask = torch.tensor([False, True, False])
     qpos, qvel = (x[mask] for x in start(model, 5.0))
     qvel[:, 0] = 0.5
@@ -96,9 +106,9 @@ def test_reset_refuses_a_mask_of_another_size(sim, model):
         sim.reset(torch.ones(4, dtype=torch.bool), *start(model))
 
 
-def test_masses_differ_in_effect_between_envs():
+def test_masses_differ_in_effect_between_envs(batch):
     model = mujoco.MjModel.from_xml_string(FREE_BODY)
-    sim = BatchSimulation(model, 2, substeps=1, num_threads=1, fields=("body_mass", "body_inertia"))
+    sim = BatchSimulation(batch, model, 2, 1, 1, ("body_mass", "body_inertia"))
     sim.field("body_mass")[1, 1] = 8.0
     sim.field("body_inertia")[1, 1] *= 4.0
     sim.update_constants()
@@ -107,16 +117,16 @@ def test_masses_differ_in_effect_between_envs():
     np.testing.assert_allclose(sim.qvel[:, 0], [4 / 2 * 0.01, 4 / 8 * 0.01])
 
 
-def test_update_constants_follows_masses(model):
-    sim = BatchSimulation(model, 2, 1, 1, fields=("body_mass", "body_inertia", "body_subtreemass"))
+def test_update_constants_follows_masses(model, batch):
+    sim = BatchSimulation(batch, model, 2, 1, 1, ("body_mass", "body_inertia", "body_subtreemass"))
     sim.field("body_mass")[1] *= 2.0
     sim.field("body_inertia")[1] *= 2.0
     sim.update_constants()
     np.testing.assert_allclose(sim.field("body_subtreemass")[:, 1], [51.437, 102.874])
 
 
-def test_friction_differs_in_effect_between_envs(spec, model):
-    sim = BatchSimulation(model, 2, 2, 1, fields=("geom_friction",))
+def test_friction_differs_in_effect_between_envs(spec, model, batch):
+    sim = BatchSimulation(batch, model, 2, 2, 1, ("geom_friction",))
     sim.field("geom_friction")[0, :, 0] = 0.05
     sim.field("geom_friction")[1, :, 0] = 1.0
     qpos = torch.zeros(2, model.nq)
@@ -140,9 +150,9 @@ def test_undeclared_fields_are_refused(sim):
         sim.field("actuator_gear")
 
 
-def test_a_wrench_at_the_centre_of_mass_is_mj_apply_ft(model, rng):
+def test_a_wrench_at_the_centre_of_mass_is_mj_apply_ft(model, batch, rng):
     """A force at the hand, with its moment, moves the robot as the generalised force that MuJoCo computes does."""
-    sim = BatchSimulation(model, N, 1, 1)
+    sim = BatchSimulation(batch, model, N, 1, 1)
     qpos, qvel = start(model)
     qpos[:, 3:7] = torch.nn.functional.normalize(torch.randn(N, 4, generator=rng), dim=1)
     qpos[:, 7:] = 0.5 * torch.randn(N, 19, generator=rng)
@@ -168,7 +178,7 @@ def test_a_wrench_at_the_centre_of_mass_is_mj_apply_ft(model, rng):
     assert np.abs(references).max() > 1.0
 
 
-def test_snapshot_and_restore_reproduce_the_future_bit_for_bit(sim, model, rng):
+def test_snapshot_and_restore_reproduce_the_future_bit_for_bit(sim, model, batch, rng):
     sim.field("body_mass").mul_(torch.tensor([0.9, 1.0, 1.2]).double()[:, None])
     sim.update_constants()
     sim.reset(everyone(), *start(model, 1.0))
@@ -192,23 +202,23 @@ def test_snapshot_and_restore_reproduce_the_future_bit_for_bit(sim, model, rng):
     sim.restore(snapshot)
     assert torch.equal(sim.sensors, snapshot.sensors)
     assert torch.equal(run(10), future)
-    stranger = BatchSimulation(model, N, 2, 1, fields=("body_mass", "body_inertia", "geom_friction"))
+    stranger = BatchSimulation(batch, model, N, 2, 1, FIELDS)
     sim.restore(snapshot)
     stranger.restore(snapshot)
     sim = stranger
     assert torch.equal(run(10), future)
 
 
-def test_restore_refuses_other_sizes_and_fields(sim, model):
-    snapshot = BatchSimulation(model, N + 1, 2, 1).snapshot()
+def test_restore_refuses_other_sizes_and_fields(sim, model, batch):
+    snapshot = BatchSimulation(batch, model, N + 1, 2, 1).snapshot()
     with pytest.raises(ValueError, match=r"snapshot\.state must have shape"):
         sim.restore(snapshot)
-    snapshot = BatchSimulation(model, N, 2, 1).snapshot()
+    snapshot = BatchSimulation(batch, model, N, 2, 1).snapshot()
     with pytest.raises(ValueError, match=r"snapshot has fields \[\], not \['body_inertia'"):
         sim.restore(snapshot)
 
 
 @pytest.mark.parametrize("bad", [{"num_envs": 0}, {"substeps": -1}])
-def test_sizes_must_be_positive(model, bad):
+def test_sizes_must_be_positive(model, batch, bad):
     with pytest.raises(ValueError, match=rf"{next(iter(bad))} must be a positive integer"):
-        BatchSimulation(model, **{"num_envs": 1, "substeps": 1, **bad})
+        BatchSimulation(batch, model, **{"num_envs": 1, "substeps": 1, **bad})

@@ -1,4 +1,4 @@
-"""MuJoCo Warp, on its processor device, against mjbatch: the same envs, as far as float32 goes.
+"""MuJoCo Warp, on its processor device, against MuJoCo: the same envs, as far as float32 goes.
 
 The first run compiles Warp's kernels, minutes on one core; they are kept in Warp's cache.
 """
@@ -19,7 +19,7 @@ from cotap.compliance.laws import LawConfig
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.randomization import Randomizer
 from cotap.robots.mjcf import build_model
-from cotap.sim import BatchSimulation, Simulation
+from cotap.sim import Simulation, make_simulation
 from cotap.sim.warp_simulation import WarpSimulation
 
 pytestmark = pytest.mark.slow
@@ -27,7 +27,7 @@ N = 6
 
 
 def both(model, fields: tuple[str, ...] = Randomizer.FIELDS) -> tuple[Simulation, Simulation]:
-    return BatchSimulation(model, N, 2, 1, fields), WarpSimulation(model, N, 2, "cpu", fields)
+    return make_simulation("mujoco", model, N, 2, 1, fields), WarpSimulation(model, N, 2, "cpu", fields)
 
 
 def start(model, height: float, rng: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
@@ -192,7 +192,7 @@ def environments(
 ) -> list[HumanoidEnv]:
     """One on each backend."""
     out = []
-    for backend, seed in zip(("mjbatch", "warp"), seeds, strict=True):
+    for backend, seed in zip(("mujoco", "warp"), seeds, strict=True):
         cfg = HumanoidEnvConfig(num_envs=num_envs, num_threads=1, backend=backend, seed=seed)
         change(cfg)
         out.append(HumanoidEnv(cfg))

@@ -44,10 +44,10 @@ class HumanoidEnvConfig:
     seed: Annotated[int, tyro.conf.Suppress] = 0
     """Seed of the environment's own random numbers. A training sets it, as it does the threads."""
     backend: str = "auto"
-    """What simulates: mjbatch (the CPU), warp (MuJoCo Warp; a GPU if there is one), or auto: warp where there are a GPU
-    and the extra `warp`, else mjbatch."""
+    """What simulates: mujoco (the CPU, MuJoCo alone), mjbatch (the CPU), warp (MuJoCo Warp; a GPU if there is one), or
+    auto: warp where there are a GPU and the extra `warp`, else mjbatch where it is installed, else mujoco."""
     num_threads: Annotated[int, tyro.conf.Suppress] = 0
-    """Physics threads of mjbatch; 0 takes every core."""
+    """Physics threads on the CPU; 0 takes every core."""
     collision: str = "full"
     """full (all shapes, against the floor and each other) or feet (only feet meet the floor)."""
     control_dt: float = 0.02

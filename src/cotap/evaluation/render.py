@@ -212,7 +212,7 @@ def record_tour(
     """One nominal robot on the tour, its arms held at `arm_pose` (U,) if there is one. Returns the environment and its
     `qpos` (T, nq) at every control step."""
     disable_disturbances(cfg)
-    cfg.num_envs, cfg.seed, cfg.backend = 1, seed, "mjbatch"
+    cfg.num_envs, cfg.seed, cfg.backend = 1, seed, "mujoco"
     cfg.terminations.episode_s = 1e4
     env = HumanoidEnv(cfg)
     if arm_pose is not None:

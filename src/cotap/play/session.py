@@ -241,7 +241,7 @@ def play_config(env_cfg: HumanoidEnvConfig, library: str = "") -> HumanoidEnvCon
     select_motion(env_cfg.motions.clips, (MIXTURE,), library)
     _find_library(env_cfg.motions.clips)
     disable_disturbances(env_cfg)
-    env_cfg.num_envs, env_cfg.num_threads, env_cfg.backend = len(ROBOTS), 1, "mjbatch"
+    env_cfg.num_envs, env_cfg.num_threads, env_cfg.backend = len(ROBOTS), 1, "mujoco"
     env_cfg.terminations.episode_s = 1e6
     env_cfg.upper_body.sampling.enabled = False  # what the page sets stays
     env_cfg.motions.clips.share, env_cfg.motions.clips.only, env_cfg.motions.clips.held_out = 1.0, (), ()

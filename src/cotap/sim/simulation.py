@@ -15,6 +15,9 @@ from cotap.checks import require_positive_int, require_shape
 
 DriveFunction = Callable[[int], torch.Tensor]
 """Called before every physics step with its number within the control step; returns `ctrl`, (num_envs, nu)."""
+MASSES = ("body_mass", "body_inertia")
+DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "actuator_acc0")
+"""Model fields that MuJoCo derives from `MASSES`. So is the mean inertia of the model's statistics."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +124,7 @@ class Simulation(ABC):
         for name, value in snapshot.fields.items():
             field = self._fields[name]
             require_shape(f"snapshot.fields[{name}]", value, tuple(field.shape))
-            constants_change |= name in {"body_mass", "body_inertia"} and not torch.equal(field, value.to(field))
+            constants_change |= name in MASSES and not torch.equal(field, value.to(field))
             field.copy_(value)
         if constants_change:  # which takes longer than all else
             self.update_constants()

@@ -11,13 +11,10 @@ import mujoco_warp as mjw
 import torch
 import warp as wp
 
-from cotap.sim.simulation import Simulation, state_size
+from cotap.sim.simulation import DERIVED, MASSES, Simulation, state_size
 
 _CONTACTS_PER_GEOM, _ON_BUMPS = 4, 16
 """Contacts for which there is room, per geom that may touch anything: on a plane, and on a height field."""
-_DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "actuator_acc0")
-"""What MuJoCo derives from masses and inertias; of `_SOURCES`, per env as well."""
-_SOURCES = {"body_mass", "body_inertia"}
 _INTEGRATION = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
@@ -45,7 +42,7 @@ class WarpSimulation(Simulation):
         super().__init__(model, num_envs, substeps)
         self._place = _warp_device(device)
         self.device = wp.device_to_torch(self._place)
-        derived = _DERIVED if _SOURCES & set(fields) else ()
+        derived = DERIVED if set(MASSES) & set(fields) else ()
         with wp.ScopedDevice(self._place):
             self._model = mjw.put_model(_supported(model), dict.fromkeys((*fields, *derived), num_envs))
             if derived:
