@@ -26,7 +26,10 @@ BROUGHT = {"PIL": "imageio", "trimesh": "viser", "pybullet_utils": "pybullet"}
 """Modules that come with others' dependencies."""
 ROOMS = {"play": "play", "deployment": "deploy", "deploy.py": "deploy", "export.py": "deploy"}
 """Rooms that need more than the extra `train`."""
-OPTIONAL = {"pybullet_engine.py": "pybullet", "warp_simulation.py": "warp", "visuals.py": "meshes"}
+OPTIONAL = {
+    "pybullet_engine.py": "pybullet", "batch_simulation.py": "mjbatch", "warp_simulation.py": "warp",
+    "visuals.py": "meshes",
+}  # fmt: skip
 """Files that need an extra of their own, and are imported only where it is asked for."""
 
 
