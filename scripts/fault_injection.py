@@ -1,4 +1,4 @@
-"""Injects faults into small trainings and shows what survives: kills at random moments, disks that fill or turn
+"""Injects faults into small trainings and shows what survives: signals at random moments, disks that fill or turn
 read-only, clocks that jump, envs that diverge, steps that raise. Prints a table; POSIX only.
 
 Every training is a forked process that runs the training command itself. One run that nothing happens to is what all
@@ -58,14 +58,13 @@ class Row:
 
 
 class Run:
-    """A training in a process of its own, watched from outside."""
+    """A training in a process of its own, watched from outside. One that has a checkpoint goes on from it; one that
+    was ended before its first begins again, in the folder that it left."""
 
     def __init__(self, folder: Path, prepare: Prepare | None = None, log: Path | None = None) -> None:
         self.folder = folder
         self.start = newest_iteration(folder)
         resume = ["--resume", newest(folder)] if self.start else ["--run-dir", folder]
-        if not self.start:
-            shutil.rmtree(folder, ignore_errors=True)  # killed before its first checkpoint: begins again
         read, write = os.pipe()
         self.log = log or Path(f"{folder}.log")
         self._status: int | None = None
@@ -172,9 +171,9 @@ def kill_runs(work: Path, reference: Path, kills: int, pace: tuple[float, float]
         kind = rng.choice([anywhere] * 4 + [saving, renaming])
         run = Run(folder, _killed_at_rename(folder, rng.randint(1, 5)) if kind == renaming else None)
         if kind == anywhere:
-            _kill_after(run, rng.uniform(0.0, pace[0] + 5.0 * pace[1]))
+            _signal_after(run, rng.uniform(0.0, pace[0] + 5.0 * pace[1]))
         elif kind == saving:
-            _kill_while_saving(run, rng)
+            _signal_while_saving(run, rng)
         if run.wait() == -signal.SIGKILL:
             row = rows[kind]
             row.injected += 1
@@ -197,6 +196,30 @@ def kill_runs(work: Path, reference: Path, kills: int, pace: tuple[float, float]
     return list(rows.values())
 
 
+def terminate_runs(work: Path, reference: Path, count: int, pace: tuple[float, float], rng: random.Random) -> list[Row]:
+    """Ask trainings to end, while they start and while they save, and go on with each from what is left."""
+    begin, saving = Row("SIGTERM during the start", 0, 0, 0, ""), Row("SIGTERM during a save", 0, 0, 0, "")
+    asked = 0
+    for k in range(count):
+        row = (begin, saving)[k % 2]
+        folder = work / f"terminated{k}"
+        run = Run(folder)
+        if row is begin:
+            _signal_after(run, rng.uniform(0.0, pace[0]), signal.SIGTERM)
+        else:
+            _signal_while_saving(run, rng, signal.SIGTERM)
+        status = run.wait()
+        lost = run.finished_iterations() - newest_iteration(folder)
+        # Before it trains it ends at once, and afterwards with a checkpoint of all that it has learned.
+        as_asked = status == -signal.SIGTERM or (status == 0 and lost == 0)
+        asked += status == 0
+        row.injected += 1
+        row.most_lost = max(row.most_lost or 0, lost)
+        row.survived += as_asked and Run(folder).wait() == 0 and _good_end(folder, reference)
+    begin.outcome = saving.outcome = f"{asked} of {count} ended with a checkpoint, the others at once; as if unasked"
+    return [begin, saving]
+
+
 def _ends(folder: Path, reference: Path) -> dict[str, bool]:
     """What must hold of a run that was disturbed, once it has been gone on with to its end."""
     same, gapless = same_end(folder, reference), one_curve(folder)
@@ -213,19 +236,19 @@ def _good_end(folder: Path, reference: Path) -> bool:
     return all(_ends(folder, reference).values())
 
 
-def _kill_after(run: Run, seconds: float) -> None:
+def _signal_after(run: Run, seconds: float, number: signal.Signals = signal.SIGKILL) -> None:
     end = time.monotonic() + seconds
     while time.monotonic() < end and run.alive():
         time.sleep(1e-3)
-    os.kill(run.pid, signal.SIGKILL)
+    os.kill(run.pid, number)
 
 
-def _kill_while_saving(run: Run, rng: random.Random) -> None:
-    """Kill as soon as an unfinished checkpoint shows, or a few milliseconds later."""
+def _signal_while_saving(run: Run, rng: random.Random, number: signal.Signals = signal.SIGKILL) -> None:
+    """As soon as an unfinished checkpoint shows, or a few milliseconds later."""
     while run.alive() and not any(run.folder.glob(".checkpoint_*")):
         time.sleep(2e-4)
     time.sleep(rng.uniform(0.0, 4e-3))
-    os.kill(run.pid, signal.SIGKILL)
+    os.kill(run.pid, number)
 
 
 def _killed_at_rename(folder: Path, number: int) -> Prepare:
@@ -476,7 +499,8 @@ def inject(kills: int, work: Path, seed: int) -> list[Row]:
     with contextlib.suppress(OSError, subprocess.CalledProcessError, AttributeError):
         own_mounts()
     reference, pace = undisturbed(work)
-    rows = kill_runs(work, reference, kills, pace, random.Random(seed))
+    rng = random.Random(seed)
+    rows = kill_runs(work, reference, kills, pace, rng) + terminate_runs(work, reference, max(2, kills // 2), pace, rng)
     rows += [*diverge(work), bad_reward(work), raising_step(work, reference), *clock_jumps(work, reference)]
     return [*rows, locked_folder(work, reference), *full_disk(work, reference)]
 
@@ -493,7 +517,9 @@ def table(rows: list[Row]) -> str:
 def main() -> int:
     """Returns the exit status: 0 if every fault was survived, else 1."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--kills", type=int, default=50, help="how often to kill a training")
+    parser.add_argument(
+        "--kills", type=int, default=50, help="how often to kill a training; half as often one is asked to end"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the moments at which it is killed")
     parser.add_argument("--json", type=Path, help="write the table here")
     options = parser.parse_args()

@@ -68,6 +68,14 @@ def test_a_file_for_which_there_is_no_room_is_named_and_the_old_one_kept(kind: s
     assert path.stat().st_size > 100
 
 
+def test_a_film_that_ffmpeg_cannot_even_begin_is_named_in_a_line(tmp_path: Path):
+    rng, path = np.random.default_rng(0), tmp_path / "film.mp4"
+    many = [rng.integers(0, 255, (256, 256, 3), np.uint8) for _ in range(200)]
+    with full_after(0), pytest.raises(OSError, match=rf"^cannot write film {re.escape(str(path))}: .*$"):
+        write_video(path, iter(many), 25.0)
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_film_is_whole_only_with_its_index(tmp_path: Path):
     path = tmp_path / "film.mp4"
     write_video(path, iter(FRAMES), 25.0)

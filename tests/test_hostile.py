@@ -19,6 +19,7 @@ import pytest
 import torch
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
+from recordings import small_recording
 
 from cotap import compare, deploy, evaluate, export, train
 from cotap.agents.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
@@ -31,16 +32,13 @@ from cotap.envs import HumanoidEnv
 from cotap.evaluation.law_options import parse_law
 from cotap.evaluation.policy import load_policy
 from cotap.evaluation.recording import (
-    EVENTS,
     SCENE,
-    TRAJECTORY,
     Recording,
     RecordingError,
     RecordingProtocol,
     load_recording,
     measure,
 )
-from cotap.evaluation.rollout import Trajectory
 from cotap.motions import __main__ as motions
 from cotap.motions.formats import FORMATS
 from cotap.motions.joblib_files import load_joblib
@@ -571,22 +569,6 @@ def test_a_motion_file_with_changed_bytes_is_read_or_refused(
         assert str(error)  # noqa: PT017
     else:
         assert all(np.isfinite(c.arms).all() for c in clips)
-
-
-SIZES = {"T": 6, "N": 2, "U": 8, "H": 2, "F": 2, "Q": 26}
-
-
-def small_recording() -> Recording:
-    """Two robots for a tenth of a second; numbers of no meaning, kinds and shapes as they are recorded."""
-
-    def zeros(shape: tuple[str | int, ...], dtype: torch.dtype) -> torch.Tensor:
-        return torch.zeros([SIZES.get(d, d) if isinstance(d, str) else d for d in ("T", "N", *shape)], dtype=dtype)
-
-    kinds = {name: torch.bool if name in EVENTS else torch.float32 for name in TRAJECTORY}
-    fields = {name: zeros(shape, kinds[name]) for name, shape in TRAJECTORY.items()}
-    scene = {name: zeros(shape, torch.float64).numpy() for name, shape in SCENE.items()}
-    about = {"robot": "h1", "sides": ["left", "right"], "gait_period_s": 0.8, "changes": [[0, {"k": 300.0}]]}
-    return Recording(Trajectory(dt=0.02, **fields), scene, about)
 
 
 def is_recording(path: Path) -> None:

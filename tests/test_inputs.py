@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from recordings import small_recording
 
 from cotap import compare
 from cotap.agents.checkpoint import load_checkpoint
@@ -207,3 +208,29 @@ def test_a_command_line_says_no_more_than_can_be_read(capsys: pytest.CaptureFixt
     said = capsys.readouterr()
     assert len(said.out + said.err) < 3000
     assert "3 could not be used" in said.out
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_more_than_there_is_memory_for_is_not_read(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A file of no bytes on the disk may have a thousand millions of them, and an archive unpack to them."""
+    path = tmp_path / name
+    monkeypatch.setattr("cotap.inputs.free_bytes", lambda: 1 << 18)
+    if name.endswith("npz") and name != "detected.npz":
+        bomb(path, ["poses", "version", "head"], 1)
+        assert re.search("unpacks to [0-9]+ bytes; there is memory for 262144", refused(name, path))
+    elif name in ("a.pt", "a.onnx", "a.json", "deepmimic.txt", "lafan.csv"):
+        with path.open("wb") as file:
+            file.truncate(1 << 19)
+        assert "has 524288 bytes; there is memory for 262144" in refused(name, path)
+
+
+def test_a_recording_longer_or_of_more_robots_than_any_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """By the numbers that its arrays agree on: what takes one time for every step would take hours."""
+    path = tmp_path / "r.npz"
+    small_recording().save(path)
+    assert load_recording(path).trajectory.fell.shape == (6, 2)
+    monkeypatch.setattr("cotap.evaluation.recording.MAX_STEPS", 5)
+    assert "is of 6 steps of 2 robots; at most 5 of 16 are read" in refused("recording.npz", path)
+    monkeypatch.setattr("cotap.evaluation.recording.MAX_STEPS", 6)
+    monkeypatch.setattr("cotap.evaluation.recording.MAX_ROBOTS", 1)
+    assert "is of 6 steps of 2 robots; at most 6 of 1 are read" in refused("recording.npz", path)

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from cotap.checks import quoted, reason_of
+from cotap.memory import free_bytes
 
 LARGEST_TEXT = 1 << 28
 """Bytes of text that are read; as numbers it takes ten times as much memory."""
@@ -49,6 +50,7 @@ def read_bytes(path: Path | str, largest: int) -> bytes:
     size = require_regular(path)
     if size > largest:
         raise InputError(f"has {size} bytes; at most {largest} are read")
+    _require_room("has", size)
     try:
         with Path(path).open("rb") as file:
             return file.read(size)  # no more than it had: memory is taken for all that is asked for
@@ -83,6 +85,7 @@ def read_arrays(path: Path | str, names: Collection[str], largest: int) -> dict[
         size = sum(info.file_size for info in found.values())
         if size > largest:
             raise InputError(f"holds {', '.join(found)} of {size} bytes when unpacked; at most {largest} are read")
+        _require_room("unpacks to", size)
         try:
             return {name: _read_array(archive, name, info) for name, info in found.items()}
         except InputError:
@@ -91,6 +94,12 @@ def read_arrays(path: Path | str, names: Collection[str], largest: int) -> dict[
             raise InputError(f"cannot be opened or read from disk: {reason_of(error)}") from error
         except Exception as error:  # zip, zlib and numpy each fail in ways of their own on rubbish
             raise InputError(f"is damaged: {reason_of(error)}") from error
+
+
+def _require_room(does: str, size: int) -> None:
+    free = free_bytes()
+    if free is not None and size > free:
+        raise InputError(f"{does} {size} bytes; there is memory for {free}")
 
 
 def _open(path: Path | str) -> zipfile.ZipFile:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import socket
 from pathlib import Path
@@ -149,6 +150,34 @@ def test_more_viewers_than_it_bears_are_turned_away(server, monkeypatch):
     with looking(port), Browser(port):
         assert refused(port) == 503
     until(lambda: refused(port) == 101)
+
+
+def test_no_flood_of_connections_takes_all_the_files_that_the_system_lets_a_program_have(server, monkeypatch):
+    """From one that opens them and says nothing: those beyond the most are let go, who looks on stays, others may."""
+    monkeypatch.setattr(websocket, "MAX_CONNECTIONS", 20)
+    port, folder = server.get_port(), Path("/proc/self/fd")
+    before = len(list(folder.iterdir())) if folder.is_dir() else 0
+    with looking(port) as viewer, contextlib.ExitStack() as flood:
+        for _ in range(60):
+            flood.enter_context(socket.create_connection(("127.0.0.1", port), 5.0))
+        until(lambda: refused_at_once(port))
+        if before:  # both ends are in this process: 60 of the flood's own
+            assert len(list(folder.iterdir())) - before < 60 + 40
+        viewer.look()
+        assert viewer.socket.recv(timeout=5.0)
+    until(lambda: get(port)[0] == 200)
+
+
+def refused_at_once(port: int) -> bool:
+    """Whether a new connection is let go before it has said anything."""
+    with socket.create_connection(("127.0.0.1", port), 5.0) as late:
+        late.settimeout(0.5)
+        try:
+            return late.recv(1) == b""
+        except ConnectionResetError:
+            return True
+        except TimeoutError:
+            return False
 
 
 def test_with_a_live_simulation_and_with_a_replay_it_is_closed(free_port, record, checkpoint, tmp_path, monkeypatch):

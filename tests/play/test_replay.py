@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import html
+import re
 import threading
 from types import SimpleNamespace
 
@@ -10,8 +12,9 @@ import numpy as np
 import pytest
 from viser import GuiEvent
 
+from cotap.checks import legible
 from cotap.play.recorder import samples_of
-from cotap.play.replay import Replay
+from cotap.play.replay import Replay, plain_text
 
 
 @pytest.fixture
@@ -118,9 +121,27 @@ def test_the_recording_is_downloaded_as_it_was_read(replay):
     assert len(sent) == 2
 
 
-def test_the_name_of_the_file_is_text_not_html(server, record, tmp_path):
-    Replay(server, record(5, 1), tmp_path / "<img src=x onerror=alert(1)>.npz")
+@pytest.mark.parametrize(
+    "name",
+    [
+        "<img src=x onerror=alert(1)>.npz", "![a](https:evil.example).npz", "[a](https:evil.example).npz",
+        "www.evil.example", "a**b_c_`d`~~e~~.npz", "&lt;b&gt;&#47;.npz", "\\![](https:evil.example)", "{alert(1)}.npz",
+    ],
+)  # fmt: skip
+def test_the_name_of_the_file_is_text(server, record, tmp_path, name):
+    """Neither HTML, nor a picture that would be fetched from elsewhere, nor a link, as viser's Markdown has them."""
+    Replay(server, record(5, 1), tmp_path / name)
     messages = server._websock_server._broadcast_buffer.message_from_id.values()
-    shown = [m.props._markdown for m in messages if type(m).__name__ == "GuiMarkdownMessage"]
-    assert any("&lt;img" in text for text in shown)
-    assert not any("<img" in text for text in shown)
+    texts = [m.props._markdown for m in messages if type(m).__name__ == "GuiMarkdownMessage"]
+    (shown,) = (text for text in texts if text.endswith(", 0.1 s"))
+    assert re.fullmatch(r"\*\*([a-z0-9 ]|\\[^a-z0-9 ])*\*\*, 0\.1 s", shown)  # every mark is one that is shown
+    assert re.sub(r"\\(.)", r"\1", shown) == f"**{name}**, 0.1 s"
+
+
+def test_the_name_of_the_file_starts_no_line_of_its_own():
+    assert plain_text("a\n# b") == r"\'a\\n\# b\'"
+    markdown = pytest.importorskip("markdown_it").MarkdownIt("commonmark").enable(["strikethrough", "table"])
+    for name in ("![a](https:evil.example)", "<b>", "&lt;", "a\n# b", "`x`", "_y_", "1. z", "- z", "> z"):
+        rendered = re.fullmatch("<p>(.*)</p>\n", markdown.render(plain_text(name)), re.DOTALL)
+        assert rendered is not None
+        assert html.unescape(rendered[1]) == legible(name)

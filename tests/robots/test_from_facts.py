@@ -82,15 +82,19 @@ def test_what_are_no_facts_is_refused(make, change, message):
 
 def test_files_that_are_not_there_or_no_json(tmp_path, spec):
     gains = {"": Gains(100.0, 2.0)}
-    path = tmp_path / "facts.json"
-    for content, message in (
-        (None, " does not exist"),
-        (b"\xff{", " is no text in UTF-8"),
-        (b"{", ": these are no facts of a robot: Expecting"),
-        (b"[" * 100_000, ": these are no facts of a robot: maximum recursion depth"),
-        (b"version https://git-lfs.github.com/spec/v1\n", " is a Git LFS pointer"),
-    ):
-        if content is not None:
-            path.write_bytes(content)
-        with pytest.raises(ValueError, match=rf"facts\.json{message}"):
-            robot_from_facts(path, "own", gains, spec.torso_body, spec.arms, spec.feet)
+    with pytest.raises(ValueError, match=r"none\.json' does not exist"):
+        robot_from_facts(tmp_path / "none.json", "own", gains, spec.torso_body, spec.arms, spec.feet)
+    rubbish = {
+        b"\xff{": "' is no text in UTF-8", b"{": ": these are no facts of a robot, not even JSON",
+        b"[" * 100_000: ": these are no facts of a robot, not even JSON",
+        b"9" * 5000: ": these are no facts of a robot, not even JSON",
+        b"[3]": ": these are no facts of a robot: TypeError",
+    }  # fmt: skip
+    for data, message in rubbish.items():
+        (tmp_path / "rubbish.json").write_bytes(data)
+        with pytest.raises(ValueError, match=rf"rubbish\.json{message}"):
+            robot_from_facts(tmp_path / "rubbish.json", "own", gains, spec.torso_body, spec.arms, spec.feet)
+    (tmp_path / "rubbish.json").unlink()
+    (tmp_path / "rubbish.json").symlink_to("/dev/zero")
+    with pytest.raises(ValueError, match=r"rubbish\.json' is no file but a device"):
+        robot_from_facts(tmp_path / "rubbish.json", "own", gains, spec.torso_body, spec.arms, spec.feet)

@@ -195,3 +195,18 @@ def test_what_cannot_be_a_robot_is_named(text, message, tmp_path, capsys):
 def test_bad_input_is_named(arguments, message, capsys):
     assert main(arguments) == 2
     assert message in capsys.readouterr().err
+
+
+def test_what_is_no_file_or_names_what_a_terminal_obeys_is_refused_in_words(tmp_path, capsys):
+    path, out = tmp_path / "robot.xml", str(tmp_path / "o.json")
+    path.symlink_to("/dev/zero")
+    assert main(["--mjcf", str(path), "--output", out]) == 2
+    assert "is no file but a device or pipe" in capsys.readouterr().err
+    path.unlink()
+    two = '<body name="a\x1b[2J{0}"><joint/><geom size="1"/></body>'
+    path.write_text(f"<mujoco><worldbody>{''.join(two.format(k) for k in range(2000))}</worldbody></mujoco>")
+    assert main(["--mjcf", str(path), "--output", out]) == 2
+    said = capsys.readouterr().err
+    assert "one body of the world must carry the robot" in said
+    assert "\x1b" not in said
+    assert len(said) < 3500

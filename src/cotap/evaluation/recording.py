@@ -42,6 +42,8 @@ _LEVELS = 8
 """How deep settings may be nested; five levels are in use."""
 MAX_BYTES = 4 << 30
 """Largest size of a recording's arrays; an hour of two robots takes half of it."""
+MAX_STEPS, MAX_ROBOTS = 400_000, 16
+"""The page records 30,000 steps of two."""
 
 
 _ENTRIES = ("head", "trajectory.dt", *(f"trajectory.{n}" for n in STEPPED), *(f"scene.{n}" for n in SCENE))
@@ -115,6 +117,10 @@ def _assemble(arrays: dict[str, np.ndarray], settings: Any) -> Recording:
         _check_array(f"scene.{name}", value, shape, (np.float32, np.float64), sizes)
         if name not in OF_SOME_LAWS and not np.isfinite(value).all():
             raise ValueError(f"scene.{name} has values that are not finite")
+    if sizes["T"] > MAX_STEPS or sizes["N"] > MAX_ROBOTS:
+        raise ValueError(
+            f"it is of {sizes['T']} steps of {sizes['N']} robots; at most {MAX_STEPS} of {MAX_ROBOTS} are read"
+        )
     tensors = {name: torch.from_numpy(arrays[f"trajectory.{name}"]) for name in STEPPED}
     return Recording(Trajectory(dt=dt, **tensors), {name: arrays[f"scene.{name}"] for name in SCENE}, settings)
 

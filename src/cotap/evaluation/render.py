@@ -172,7 +172,10 @@ def write_video(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
     def write(temporary: Path) -> None:
         with imageio.get_writer(temporary, format="FFMPEG", fps=fps, macro_block_size=8, quality=7) as writer:  # pyright: ignore
             for frame in frames:
-                writer.append_data(frame)
+                try:
+                    writer.append_data(frame)
+                except OSError as error:  # imageio adds all that ffmpeg was told
+                    raise OSError(f"cannot write film {path}: ffmpeg stopped ({reason_of(error)})") from error
         if "moov" not in mp4_boxes(temporary):  # ffmpeg is another program, and imageio does not say that it failed
             raise OSError(f"cannot write film {path}: ffmpeg did not finish it (disk full?)")
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import html
+import re
 import threading
 import time
 from pathlib import Path
@@ -10,7 +10,7 @@ from typing import Any
 
 import viser
 
-from cotap.checks import quoted
+from cotap.checks import legible, quoted
 from cotap.evaluation.recording import Recording, RecordingError
 from cotap.play.archive import Archive
 from cotap.play.controls import SPEED, Number, Refused
@@ -21,6 +21,13 @@ from cotap.play.scene import Scene
 from cotap.robots import ROBOTS as KNOWN_ROBOTS
 
 DRAW_HZ = 25.0
+_MARKS = re.compile(r"[!-/:-@\[-`{-~]")
+
+
+def plain_text(name: str) -> str:
+    """A name in Markdown: a file's name comes with the file, and viser's browsers show pictures from elsewhere, follow
+    links and run HTML that they find in text."""
+    return _MARKS.sub(r"\\\g<0>", legible(name))
 
 
 class Replay:
@@ -54,8 +61,7 @@ class Replay:
         self._archive = Archive(path.parent, self._notices)
         self._archive.newest, self._archive.path = recording, path
         gui = server.gui
-        # A file's name comes with the file, and viser's browsers run what HTML they find in text.
-        gui.add_markdown(f"**{html.escape(path.name)}**, {len(self._samples) * self._dt:.1f} s")
+        gui.add_markdown(f"**{plain_text(path.name)}**, {len(self._samples) * self._dt:.1f} s")
         self._playing = gui.add_checkbox("play", True)
         self._speed, self._at = SPEED.default, 0.0
         end = max(self._dt, round(self._dt * (len(self._samples) - 1), 6))

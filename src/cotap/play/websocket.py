@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable
 from http import HTTPStatus
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 import viser
@@ -19,6 +20,9 @@ from cotap.play.messages import MAX_BYTES, ViewerCameraMessage, parse
 
 MAX_VIEWERS = 32
 """How many look on at once."""
+MAX_CONNECTIONS = 128
+"""How many connections are open at once, of viewers and of those that have not said yet what they want: for each the
+system keeps a file open, and it lets a program have some thousand."""
 MAX_QUEUE = 4
 """How many messages of a viewer wait to be read."""
 
@@ -29,6 +33,14 @@ class Viewer(ServerConnection):
     """A browser's connection. What a browser may not say never reaches viser."""
 
     _counted = False
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Take a connection, or let it go if there are too many."""
+        if len(self.server.handlers) < MAX_CONNECTIONS:
+            super().connection_made(transport)
+            return
+        transport.set_protocol(asyncio.Protocol())  # this one has nothing that could be lost
+        cast(asyncio.Transport, transport).abort()
 
     async def recv(self, decode: bool | None = None) -> bytes:
         """The next message that may be said."""

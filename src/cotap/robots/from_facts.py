@@ -9,7 +9,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from cotap.checks import reason_of
+from cotap.checks import legible
 from cotap.inputs import InputError, read_text
 from cotap.robots.kinematics import body_frame, default_angles
 from cotap.robots.spec import ArmSpec, BodySpec, FootSpec, GeomSpec, JointSpec, RobotSpec
@@ -53,16 +53,15 @@ def robot_from_facts(
     Raises:
         ValueError: the file cannot be read as facts, a joint has no gains, or the robot contradicts itself.
     """
+    content = _read(facts)
     try:
-        content = json.loads(read_text(facts))
         bodies = _arms_last([_body(entry, visuals) for entry in content["bodies"]], arms)
         entries = {entry["name"]: entry["joint"] for entry in content["bodies"]}
         joints = tuple(_joint(entries[b.name], gains) for b in bodies if b.joint is not None)
         excludes = tuple((first, second) for first, second in content["contact_excludes"])
-    except InputError as error:
-        raise ValueError(f"{facts} {error}") from error
-    except (LookupError, TypeError, RecursionError, json.JSONDecodeError) as error:
-        raise ValueError(f"{facts}: these are no facts of a robot: {reason_of(error)}") from error
+    except (LookupError, TypeError, AttributeError, RecursionError) as error:
+        reason = legible(f"{type(error).__name__} {error}")
+        raise ValueError(f"{facts}: these are no facts of a robot: {reason}") from error
     names, free = {b.name for b in bodies}, [b.name for b in bodies if b.joint is None]
     if lost := [name for name in entries if name not in names]:
         raise ValueError(f"{facts}: the parents of {', '.join(lost)} do not lead to 'world'")
@@ -70,6 +69,15 @@ def robot_from_facts(
         raise ValueError(f"{facts}: one body must be without a joint, the base, got {', '.join(free) or 'none'}")
     spec = RobotSpec(name, tuple(bodies), joints, free[0], torso_body, arms, feet, 0.0, excludes, **fields)
     return dataclasses.replace(spec, nominal_height_m=nominal_height_m or _torso_height(spec))
+
+
+def _read(facts: Path) -> Any:
+    try:
+        return json.loads(read_text(facts))
+    except InputError as error:
+        raise ValueError(f"facts {str(facts)!r} {error}") from error
+    except (ValueError, RecursionError) as error:  # not JSON, or nested without end
+        raise ValueError(f"{facts}: these are no facts of a robot, not even JSON: {legible(str(error))}") from error
 
 
 def _joint(entry: dict[str, Any], gains: Mapping[str, Gains]) -> JointSpec:

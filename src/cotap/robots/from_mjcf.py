@@ -212,7 +212,7 @@ def _mirrors(model: mujoco.MjModel, data: mujoco.MjData) -> dict[int, tuple[str,
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Parse, convert, report. Returns the exit status: 0, or 2 for bad input."""
+    """Parse, convert, report. Returns the exit status: 0, 2 for bad input, or 130 if interrupted."""
     options = tyro.cli(FromMjcfOptions, args=argv, prog="python -m cotap.robots.from_mjcf")
     try:
         require_range("velocity_limit", options.velocity_limit, 0.01, 1e4)
@@ -223,6 +223,9 @@ def main(argv: list[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         print(f"error: {shortened(str(error))}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print("interrupted: nothing was written", file=sys.stderr)
+        return 130
     joints = [body["joint"] for body in facts["bodies"] if body["joint"]]
     mass = sum(body["mass"] for body in facts["bodies"])
     print(f"{options.output}: {len(facts['bodies'])} bodies, {len(joints)} joints, {mass:.3f} kg")
