@@ -83,7 +83,8 @@ def test_forces_on_hands_are_along_the_heading(spec, monkeypatch):
     robot, given = Robot(make_engine(ENGINE, spec), ENGINE, spec, 0.02, Perturbations()), []
     askew(robot)
     turn = yaw_of(robot.engine.data, spec.torso_body)
-    monkeypatch.setattr(robot.engine, "advance", lambda _law, _steps, force_w: given.append(force_w))
+    monkeypatch.setattr(robot.engine, "advance", lambda _law, _steps, forces: given.extend(forces))
     forces_h = np.array([[8.0, -5.0, -12.0], [0.0, 3.0, 0.0]])
     robot.act(robot.holding(np.zeros(19)), forces_h)
-    np.testing.assert_allclose(given[0], forces_h @ turn, atol=1e-9)
+    assert [(force.body, force.point) for force in given] == [(arm.hand_body, arm.hand_point) for arm in spec.arms]
+    np.testing.assert_allclose([force.force_w for force in given], forces_h @ turn, atol=1e-9)

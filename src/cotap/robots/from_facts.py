@@ -9,7 +9,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from cotap.checks import legible
+from cotap.checks import legible, reason_of
 from cotap.inputs import InputError, read_text
 from cotap.robots.kinematics import body_frame, default_angles
 from cotap.robots.spec import ArmSpec, BodySpec, FootSpec, GeomSpec, JointSpec, RobotSpec
@@ -60,8 +60,7 @@ def robot_from_facts(
         joints = tuple(_joint(entries[b.name], gains) for b in bodies if b.joint is not None)
         excludes = tuple((first, second) for first, second in content["contact_excludes"])
     except (LookupError, TypeError, AttributeError, RecursionError) as error:
-        reason = legible(f"{type(error).__name__} {error}")
-        raise ValueError(f"{facts}: these are no facts of a robot: {reason}") from error
+        raise ValueError(f"{facts}: these are no facts of a robot: {reason_of(error)}") from error
     names, free = {b.name for b in bodies}, [b.name for b in bodies if b.joint is None]
     if lost := [name for name in entries if name not in names]:
         raise ValueError(f"{facts}: the parents of {', '.join(lost)} do not lead to 'world'")
