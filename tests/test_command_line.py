@@ -143,3 +143,11 @@ def test_an_interrupted_command_ends_without_a_traceback(command, work, argument
     monkeypatch.setattr(work, interrupted)
     assert module.main(arguments) == (0 if command == "play" else 130)  # which only that can end
     assert "Traceback" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["train", "evaluate", "deploy"])
+def test_a_usage_message_loads_no_compiler_and_no_library_that_it_does_not_need(name):
+    heavy = "{'torch._dynamo', 'sympy', 'scipy', 'matplotlib'}"
+    code = f"import sys, cotap.{name}; print(*sorted({heavy} & sys.modules.keys()))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
+    assert done.stdout.strip() == ""

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import cotap.uncompiled  # noqa: F401 - before what would load the compiler
+
+# isort: split
+
 import contextlib
 import os
 import platform

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from scipy.optimize import isotonic_regression
 
 from cotap.checks import require_range
 from cotap.envs import HumanoidEnv
@@ -145,6 +144,8 @@ def _crossing(impulse: torch.Tensor, level: torch.Tensor, fell: torch.Tensor) ->
     count = torch.bincount(level, minlength=len(impulse))
     seen = count > 0
     rate = torch.bincount(level, fell.double(), minlength=len(impulse))[seen] / count[seen]
+    from scipy.optimize import isotonic_regression  # half a second, which no other protocol needs
+
     x, y = impulse[seen].double(), torch.from_numpy(isotonic_regression(rate.numpy(), weights=count[seen].numpy()).x)
     above = (y >= 0.5).nonzero().flatten()
     if len(above) == 0 or int(above[0]) == 0:

@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 
 from cotap.motions.library import FPS, MotionClip
 
@@ -27,6 +25,9 @@ def pace(clip: MotionClip, max_speed: np.ndarray, max_acceleration: float) -> Mo
     frames = np.arange(len(clip.arms), dtype=np.float64)
     if len(frames) < 4:  # nothing to differentiate twice
         return clip
+    from scipy.interpolate import CubicSpline  # half a second, which no other reader of configs needs
+    from scipy.ndimage import gaussian_filter1d, minimum_filter1d
+
     path = CubicSpline(frames, np.concatenate((clip.arms, clip.root), 1))
     at = frames
     for _ in range(_PASSES):

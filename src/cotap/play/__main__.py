@@ -13,7 +13,7 @@ import tyro
 
 from cotap.checks import require_one_of, shortened
 from cotap.play import ROBOTS
-from cotap.play.startup import import_tensordict, uncollected
+from cotap.play.startup import uncollected
 
 if TYPE_CHECKING:
     from viser import ViserServer
@@ -116,8 +116,7 @@ def _live(options: PlayOptions) -> Callable[[ViserServer], App]:
 
         import torch
 
-        import_tensordict()  # before what would import it whole
-
+        import cotap.uncompiled  # noqa: F401
         from cotap.play.app import App
         from cotap.play.session import Session
 
@@ -130,8 +129,7 @@ def _live(options: PlayOptions) -> Callable[[ViserServer], App]:
 
 def _policies(options: PlayOptions, robot: str) -> dict[str, Path]:
     """What can be chosen, by the names that are shown; the first runs at first. Raises ValueError if there is none."""
-    import_tensordict()
-
+    import cotap.uncompiled  # noqa: F401
     from cotap.evaluation.policy import find_checkpoint
 
     policies = {name: find_checkpoint(name) for name in options.checkpoint} | _shipped_policies(robot)
@@ -142,8 +140,7 @@ def _policies(options: PlayOptions, robot: str) -> dict[str, Path]:
 
 def _robot_of(checkpoints: tuple[str, ...]) -> str:
     """The robot of all these. Raises ValueError if one cannot be used, or is of another robot."""
-    import_tensordict()
-
+    import cotap.uncompiled  # noqa: F401
     from cotap.evaluation.policy import find_checkpoint, load_policy
 
     robots = {name: load_policy(find_checkpoint(name)).env_config.robot for name in checkpoints}
@@ -164,8 +161,7 @@ def _shipped_policies(robot: str) -> dict[str, Path]:
 
 def _replay(options: PlayOptions) -> Callable[[ViserServer], Replay]:
     """Read the recording. Returns what fills the page."""
-    import_tensordict()
-
+    import cotap.uncompiled  # noqa: F401
     from cotap.evaluation.recording import load_recording
 
     recording = load_recording(options.replay)

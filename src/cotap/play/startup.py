@@ -17,22 +17,3 @@ def uncollected() -> Iterator[None]:
     finally:
         gc.freeze()
         gc.enable()
-
-
-def import_tensordict() -> None:
-    """Import tensordict without torch's compiler, which takes longer to load than torch itself.
-
-    On import, tensordict informs the compiler about three of its functions. Where nothing is compiled, as on the
-    page, that changes nothing. Without effect where tensordict is there already.
-    """
-    import torch.compiler
-
-    names = ("allow_in_graph", "assume_constant_result")
-    kept = {name: getattr(torch.compiler, name) for name in names}
-    try:
-        for name in names:
-            setattr(torch.compiler, name, lambda function: function)
-        import tensordict  # noqa: F401
-    finally:
-        for name, function in kept.items():
-            setattr(torch.compiler, name, function)
