@@ -40,5 +40,6 @@ def test_what_a_protocol_asks_for_is_there(name):
     cfg = PROTOCOLS[name]().configure(lively())
     assert any(cfg.forces.scripted.force) == (name not in ("velocity-tracking", "modulation", "tour"))
     assert (cfg.forces.punches.force_n > 0.0) == (name == "tour")
-    assert cfg.randomization.enabled == (name not in ("static-stiffness", "fidelity", "stability", "tour"))
+    undisturbed = ("static-stiffness", "fidelity", "stability", "passivity", "tour")
+    assert cfg.randomization.enabled == (name not in undisturbed)
     assert not any(source.enabled for source in (cfg.forces.pushes, cfg.forces.hand_loads))
