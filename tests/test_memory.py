@@ -26,7 +26,7 @@ MANY = "1000000000"
         (evaluate.main, ["velocity-tracking", "--num-envs", MANY], "num_envs 1000000000 would take"),
         (evaluate.main, ["velocity-tracking", "--num-envs", "1" + "0" * 400], "would take"),
         (evaluate.main, ["stability", "--poses", MANY], "poses must lie in [1, 1000000]"),
-        (evaluate.main, ["punches", "--waypoints", MANY, "--duration", "0"], "waypoints must lie in [1, 10000]"),
+        (evaluate.main, ["tour", "--waypoints", MANY], "waypoints must lie in [1, 10000]"),
         (train.main, ["--num-envs", MANY], "num_envs 1000000000 would take"),
         (train.main, ["base", "--num-envs", MANY], "num_envs 1000000000 would take"),
         (train.main, ["base", "--num-envs", "2", "--ppo.steps", MANY], "ppo.steps 1000000000 of 2 envs would take"),
