@@ -66,9 +66,11 @@ def test_a_shipped_evaluation_is_what_the_policy_does(name: str, evaluation: str
     assert kept["settings"]["checkpoint_sha256"] == sha256(path)
     args = ["64" if arg == ENVS else arg for arg in EVALUATIONS[evaluation]]
     now = evaluate([*args, "--checkpoint", str(path), "--seed", "1", "--threads", "1"])
-    changed = {"seed", "num_envs", "checkpoint_sha256", "env"}
-    settings = [{k: v for k, v in result["settings"].items() if k not in changed} for result in (kept, now)]
-    assert json.loads(json.dumps(settings[1])) == settings[0]
+    settings = kept["settings"], json.loads(json.dumps(now["settings"]))
+    known = settings[0].keys() & settings[1].keys()  # options come and go
+    changed = {name for name in known if settings[0][name] != settings[1][name]}
+    assert len(known) > 20
+    assert changed <= {"seed", "num_envs", "env"}
     compared = 0
     for measure, before in kept["metrics"].items():
         after = now["metrics"][measure]
