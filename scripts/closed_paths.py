@@ -29,7 +29,7 @@ from cotap.robots.chains import arm_model
 
 
 def _cotap(stiffness: float, **fields: Any) -> LawConfig:
-    return LawConfig("cotap", (stiffness,) * 3, **fields)
+    return LawConfig("cotap", (stiffness, stiffness, stiffness), **fields)
 
 
 ROWS: dict[str, LawConfig] = {

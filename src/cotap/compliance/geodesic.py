@@ -61,9 +61,10 @@ def held_stiffness(
     left = 2.0 * room.detach() - _rounding(old, new, e, k_old.dtype).detach()
     share = _largest_share(weights, rates, weights.sum(-1) + left)
 
-    log = log_from_eigenvectors(ratio, values, vectors)
-    whole = torch.linalg.matrix_exp(share[..., None, None] * log)
-    if torch.is_grad_enabled():
+    whole = (vectors * (share.unsqueeze(-1) * rates).exp().unsqueeze(-2)) @ vectors.transpose(-1, -2)
+    if torch.is_grad_enabled():  # the same, differentiable at equal eigenvalues, too
+        log = log_from_eigenvectors(ratio, values, vectors)
+        whole = torch.linalg.matrix_exp(share[..., None, None] * log)
         # Value zero; derivatives those of the equation that the share solves (implicit function theorem).
         excess = (tall * (whole @ tall.unsqueeze(-1)).squeeze(-1)).sum(-1) - tall.square().sum(-1) - 2.0 * room
         slope = (weights * rates * (share.unsqueeze(-1) * rates).exp()).sum(-1)
