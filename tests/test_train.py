@@ -11,6 +11,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -23,6 +24,7 @@ from cotap.envs import HumanoidEnv
 from cotap.envs.rewards import LowerRewards, UpperRewards
 from cotap.evaluation import policy
 from cotap.pipeline import PipelineOptions
+from cotap.sim import resolve_backend
 
 # Every option that these tests use, as typed on the command line.
 ENVS = "--num-envs"
@@ -255,6 +257,7 @@ def test_a_run_leaves_config_checkpoint_and_logs(base: Path):
     assert config["training"]["env"]["num_envs"] == 8
     assert GAMMA in config["command"]
     assert {"commit", "machine"} <= config.keys()
+    assert config["simulation"] == f"{resolve_backend('auto')}, MuJoCo {mujoco.__version__}"
     content = newest(base)
     assert content["config"] == config
     assert (content["iteration"], content["samples"]) == (2, 2 * 6 * 8)

@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
+import mujoco
 import tyro
 
 from cotap import __version__
@@ -344,8 +345,9 @@ def provenance(command: str, backend: str) -> dict[str, str]:
         commit += " with local changes" if dirty.strip() else ""
     except (OSError, subprocess.CalledProcessError):
         commit = f"cotap {__version__}"
+    simulation = f"{resolve_backend(backend)}, MuJoCo {mujoco.__version__}"
     machine = f"{platform.machine()}, {os.cpu_count()} processors, Python {platform.python_version()}"
-    return {"commit": commit, "command": command, "machine": machine, "simulation": resolve_backend(backend)}
+    return {"commit": commit, "command": command, "machine": machine, "simulation": simulation}
 
 
 def _new_run_dir(stage: str) -> Path:
