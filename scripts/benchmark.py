@@ -25,7 +25,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,6 @@ import gymnasium
 import mujoco
 import numpy as np
 import torch
-from mjbatch import Batch
 from mujoco import rollout
 
 from cotap.agents.actors import as_dict
@@ -52,6 +51,7 @@ from cotap.motions.reference import ReferenceConfig, ReferenceMotion
 from cotap.robots import RobotSpec, h1
 from cotap.robots.chains import arm_model
 from cotap.robots.mjcf import build_model
+from cotap.sim import batch_of
 
 PEER_ENVS = 32
 SUBSTEPS, TIMESTEP_S = 4, 0.005
@@ -87,10 +87,10 @@ def reference_model() -> mujoco.MjModel:
     return model
 
 
-def full_env(num_envs: int) -> HumanoidEnv:
+def full_env(num_envs: int, threads: int, backend: str = "mjbatch") -> HumanoidEnv:
     """Everything on that recipe `default` has, as at the end of its training; envs time out at different times."""
     cfg = BASE_RECIPES["default"]().env
-    cfg.num_envs, cfg.backend = num_envs, "mjbatch"
+    cfg.num_envs, cfg.num_threads, cfg.backend = num_envs, threads, backend
     env = HumanoidEnv(cfg)
     env.samples = 10**9
     env.episode_length_buf = torch.randint_like(env.episode_length_buf, high=env.max_episode_length)
@@ -114,9 +114,9 @@ def record(env: HumanoidEnv, policy: Actor, warm_up: int, steps: int) -> Recordi
 class PhysicsReference:
     """Plain mjbatch on a recording; only the stepping is timed."""
 
-    def __init__(self, recording: Recording, seconds: float) -> None:
+    def __init__(self, recording: Recording, seconds: float, threads: int) -> None:
         self.recording, self.seconds = recording, seconds
-        self.batch = Batch(reference_model(), recording.qpos.shape[1])
+        self.batch = batch_of("mjbatch")(reference_model(), recording.qpos.shape[1], threads)
         self.qpos, self.qvel, self.ctrl = (self.batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
 
     def run(self) -> float:
@@ -289,10 +289,10 @@ def gymnasium_rate(vector: gymnasium.vector.VectorEnv, seconds: float) -> float:
     return rate
 
 
-def rollout_rate(recording: Recording, seconds: float) -> float:
+def rollout_rate(recording: Recording, seconds: float, threads: int) -> float:
     """Control steps per second of `mujoco.rollout` on the recording, from its states with its torques."""
     model = reference_model()
-    threads = os.cpu_count() or 1
+    threads = threads or os.cpu_count() or 1
     data = [mujoco.MjData(model) for _ in range(threads)]
     k, n = recording.qpos.shape[:2]
     pool = rollout.Rollout(nthread=threads)
@@ -351,16 +351,23 @@ def machine() -> dict[str, Any]:
         "cores": os.cpu_count(),
         "torch_threads": torch.get_num_threads(),
         "python": platform.python_version(),
-        "versions": {name: version(name) for name in VERSIONED},
+        "versions": {name: _version(name) for name in VERSIONED},
     }
 
 
-def rates_by_size(sizes: list[int], policy: Actor, seconds: float, repeats: int) -> dict[str, float]:
+def _version(name: str) -> str | None:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
+
+
+def rates_by_size(sizes: list[int], policy: Actor, options: argparse.Namespace) -> dict[str, float]:
     """Environment steps per second at each number of envs: medians over rounds."""
     rates: dict[str, list[float]] = {str(n): [] for n in sizes}
-    for _ in range(repeats):
+    for _ in range(options.repeats):
         for n in sizes:
-            stepping = EnvStepping(full_env(n), policy, seconds)
+            stepping = EnvStepping(full_env(n, options.threads), policy, options.seconds)
             stepping.run()  # warm up
             rates[str(n)].append(stepping.run())
     return {n: statistics.median(values) for n, values in rates.items()}
@@ -380,13 +387,15 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     num_envs, seconds, repeats = options.num_envs, options.seconds, options.repeats
     name, policy = actor(options.checkpoint)
     memory = peak_memory_mib(num_envs)  # before this process grows, whose size a child's peak begins with
-    env = full_env(num_envs)
+    env = full_env(num_envs, options.threads)
     recording = record(env, policy, WARM_UP_STEPS, options.steps)
     parts: dict[str, Callable[[], float]] = {
-        "physics": PhysicsReference(recording, seconds).run,
+        "physics": PhysicsReference(recording, seconds, options.threads).run,
         "env": EnvStepping(env, policy, seconds).run,
     }
-    train_env = full_env(num_envs)  # of its own: an untrained policy falls, and would leave the other on the ground
+    train_env = full_env(
+        num_envs, options.threads
+    )  # of its own: an untrained policy falls, and would leave the other on the ground
     networks = {"default": "train", "paper": "train_paper"}
     for kind in options.networks:
         parts[networks[kind]] = TimedTraining(train_env, BASE_RECIPES[kind]().ppo).run
@@ -398,14 +407,14 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     parts["passive"] = Compliance(num_envs, seconds, passive=True).run
     parts["inverse_kinematics"] = InverseKinematics(num_envs, seconds).run
     parts["compliance_literal"] = LiteralCompliance(num_envs, seconds).run
-    parts["mujoco_rollout"] = lambda: rollout_rate(recording, seconds)
+    parts["mujoco_rollout"] = lambda: rollout_rate(recording, seconds, options.threads)
     makers = [PlainEnv] * PEER_ENVS
     parts["gymnasium_async"] = lambda: gymnasium_rate(gymnasium.vector.AsyncVectorEnv(makers), seconds)
     parts["gymnasium_sync"] = lambda: gymnasium_rate(gymnasium.vector.SyncVectorEnv(makers), seconds)
     results = rounds(parts, repeats)
     median = {name: statistics.median(rates) for name, rates in results.items()}
     del parts, env, train_env
-    by_size = rates_by_size(options.sizes, policy, seconds, repeats)
+    by_size = rates_by_size(options.sizes, policy, options)
     return {
         "num_envs": num_envs,
         "policy": name,
@@ -501,6 +510,7 @@ def main() -> int:
     parser.add_argument("--steps", type=int, default=20, help="control steps recorded for the physics reference")
     parser.add_argument("--sizes", type=sizes, default=[512, 1024, 2048, 4096, 8192], help="comma-separated")
     parser.add_argument("--networks", nargs="+", choices=("default", "paper"), default=["default", "paper"])
+    parser.add_argument("--threads", type=int, default=0, help="threads of physics and torch; 0 takes every core")
     parser.add_argument("--checkpoint", default="", help="policy to record and drive with; by default the shipped base")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--quick", action="store_true", help="small and short: shows that it runs, measures little")
@@ -512,6 +522,9 @@ def main() -> int:
         for name in ("num_envs", "repeats", "steps"):
             require_positive_int(name, getattr(options, name))
         require_range("seconds", options.seconds, 1e-3, 1e6)
+        require_range("threads", options.threads, 0, 4096)
+        if options.threads:
+            torch.set_num_threads(options.threads)
         if options.json:
             options.json.parent.mkdir(parents=True, exist_ok=True)
         result = measure(options)
