@@ -349,14 +349,6 @@ class Properties:
                 f"| {1e3 * row['wrong_model_shift']:.1f} | {' / '.join(f'{v:.1%}' for v in shares)} "
                 f"| {' / '.join(f'{v:.1%}' for v in energy)} | {PROPERTIES.get(ROWS[name]['method'], '')} |"
             )
-        lines += ["", "| law | hand held by [N/m] | joint errors [rad] | largest real part [1/s] | poses unstable |",
-                  "|---|---|---|---|---|"]  # fmt: skip
-        for name, row in result["rows"].items():
-            lines += [
-                f"| {name} | {r['wall']:g} | {r['load_rad']:g} | {r['largest_real_part']:+.2f} "
-                f"| {r['share_unstable']:.1%} |"
-                for r in row["linearised"]
-            ]
         lines += ["", "| law | stiffness | least energy, mean [J] | least of all [J] | trials drawn from | diverged |",
                   "|---|---|---|---|---|---|"]  # fmt: skip
         for name, row in result["rows"].items():

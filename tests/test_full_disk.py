@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from full_disk import full_after
 
 from cotap.agents.checkpoint import save_checkpoint, write_json
 from cotap.evaluation.render import contact_sheet, mp4_boxes, write_video
@@ -21,19 +21,7 @@ from cotap.motions import __main__ as motions
 from cotap.motions.library import shipped_library
 from cotap.robots import h1
 
-resource = pytest.importorskip("resource")
 FRAMES = [np.random.default_rng(k).integers(0, 255, (64, 64, 3), dtype=np.uint8) for k in range(30)]
-
-
-@contextmanager
-def full_after(size: int) -> Iterator[None]:
-    """No file can be longer than so many bytes: writing more fails as on a full disk, in other programs, too."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 def a_figure(path: Path) -> None:

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import contextlib
 import copy
 import errno
 import json
 import os
 import pickle
 import random
-import resource
 import stat
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from full_disk import full_after
 
 from cotap.agents.checkpoint import (
     FORMAT,
@@ -320,26 +319,15 @@ def test_interrupted_save_leaves_the_old_file_and_nothing_else(good: Path, monke
     assert good.read_bytes() == before
 
 
-@contextlib.contextmanager
-def files_limited_to(size: int) -> Iterator[None]:
-    """Writes beyond `size` bytes of a file fail, as on a full disk, however the file is written."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-
-
 def test_a_file_that_cannot_be_written_whole_is_not_written_at_all(good: Path):
     """As torch itself reports it, with nothing patched."""
     before = good.read_bytes()
-    with files_limited_to(8192), pytest.raises(OSError) as error:  # noqa: PT011  the reason is the system's
+    with full_after(8192), pytest.raises(OSError) as error:  # noqa: PT011  the reason is the system's
         save_checkpoint(good, {"weights": torch.randn(100_000)})
     assert names(good.parent) == [good.name]
     assert good.read_bytes() == before
     assert str(error.value)
-    with files_limited_to(8192), pytest.raises(OSError, match="File too large"):
+    with full_after(8192), pytest.raises(OSError, match="File too large"):
         write_json(good.with_suffix(".json"), ["x" * 10_000])
     assert names(good.parent) == [good.name]
 

@@ -34,8 +34,8 @@ def test_the_stance_of_the_g1_is_the_published_one():
     assert stance.crane_height_m == pytest.approx(0.793)
     assert stance.fallen_height_m == pytest.approx(0.20)
     inertia = 2 * [*[0.003610] * 5, 0.00425, 0.00425]  # wrists pitch and yaw by a smaller motor of a larger gear
-    assert stance.arm_kp.tolist() == pytest.approx([i * (20.0 * math.pi) ** 2 for i in inertia], rel=1e-5)
-    assert stance.arm_kd.tolist() == pytest.approx([4.0 * i * 20.0 * math.pi for i in inertia], rel=1e-5)
+    assert stance.arm_kp.tolist() == pytest.approx([i * (20.0 * math.pi) ** 2 for i in inertia], rel=1e-4)
+    assert stance.arm_kd.tolist() == pytest.approx([4.0 * i * 20.0 * math.pi for i in inertia], rel=1e-4)
 
 
 def test_under_the_published_crane_joints_stay_in_the_stance(any_spec):
@@ -68,8 +68,8 @@ def test_the_stance_of_the_h1_has_the_same_angles_and_its_own_heights_and_gains(
     assert stance.crane_height_m / 0.793 == pytest.approx(standing / 0.7565, rel=2e-3)
     assert stance.fallen_height_m == pytest.approx(0.2 / 0.793 * stance.crane_height_m)
     assert stance.chin_height_m == pytest.approx(0.42999 + 0.1 / 0.793 * stance.crane_height_m)
-    assert stance.arm_kp.tolist() == [spec.joint(name).kp for name in spec.upper_joints]
-    assert stance.arm_kd.tolist() == [spec.joint(name).kd for name in spec.upper_joints]
+    assert stance.arm_kp.tolist() == pytest.approx(8 * [394.784], rel=1e-5)  # of rotors of 0.1 kg m^2
+    assert stance.arm_kd.tolist() == pytest.approx(8 * [25.1327], rel=1e-5)
 
 
 def test_a_stance_is_its_own_mirror_image_and_within_limits(any_spec):
@@ -191,8 +191,6 @@ def test_a_fall_is_a_low_pelvis_and_nothing_else(robot):
 
 @pytest.mark.parametrize("law", [[], ["--method", "cotap", "--stiffness", "300"]])
 def test_the_command_writes_json_table_and_plot(checkpoints, robot, law, tmp_path, capsys):
-    if law and robot not in ("h1", "g1"):
-        pytest.skip("cotap needs one position gain on all joints of an arm")
     out, plot = tmp_path / "tour.json", tmp_path / "tour.png"
     options = [*ARGUMENTS, *law, "--json", str(out), "--plot", str(plot)]
     assert main(["tour", "--checkpoint", str(checkpoints(robot)), *options]) == 0

@@ -7,7 +7,7 @@ import json
 
 import pytest
 import torch
-from batches import BATCHES, batch_named
+from batches import BATCHES, batch_named, require_that_one_diverges_alone
 from random_policy import save_random_policy
 
 from cotap.compliance.laws import LawConfig
@@ -99,18 +99,7 @@ def test_the_loops_numbers_do_not_depend_on_its_threads(spec, model, threads):
 def test_an_env_that_diverges_takes_no_other_along(spec, model, name, rng, in_tmp_path):  # noqa: ARG001
     sims = [BatchSimulation(batch_named(name), model, N, 2, 1) for _ in range(2)]
     qpos, qvel = start(spec, N, rng)
-    for sim in sims:
-        sim.reset(everyone(), qpos, qvel)
-    sims[0].qpos[2, 10] = float("nan")
-    for sim in sims:
-        for _ in range(5):
-            sim.step(lambda _: torch.zeros(N, model.nu))
-    others = torch.arange(N) != 2
-    assert not torch.isfinite(sims[0].qpos[2]).all()
-    assert torch.equal(sims[0].qpos[others], sims[1].qpos[others])
-    sims[0].reset(~others, qpos[2:3], qvel[2:3])
-    sims[0].step(lambda _: torch.zeros(N, model.nu))
-    assert torch.isfinite(sims[0].qpos).all()
+    require_that_one_diverges_alone(sims, qpos, qvel)
 
 
 @pytest.mark.parametrize("threads", [1, 2])

@@ -11,6 +11,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
+from batches import require_that_one_diverges_alone
 from scipy.stats import ks_2samp
 
 pytest.importorskip("mujoco_warp", reason="needs the extra warp")
@@ -173,18 +174,7 @@ def test_one_backend_goes_on_from_the_other(model, rng, forwards):
 def test_a_env_that_diverges_takes_no_other_along(model, rng):
     sims = [WarpSimulation(model, N, 2, "cpu", Randomizer.FIELDS) for _ in range(2)]
     qpos, qvel = start(model, 1.0, rng)
-    for sim in sims:
-        sim.reset(everyone(), qpos, qvel)
-    sims[0].qpos[2, 10] = float("nan")
-    for sim in sims:
-        for _ in range(5):
-            sim.step(lambda _: torch.zeros(N, model.nu))
-    others = torch.arange(N) != 2
-    assert not torch.isfinite(sims[0].qpos[2]).all()
-    assert torch.equal(sims[0].qpos[others], sims[1].qpos[others])
-    sims[0].reset(~others, qpos[2:3], qvel[2:3])
-    sims[0].step(lambda _: torch.zeros(N, model.nu))
-    assert torch.isfinite(sims[0].qpos).all()
+    require_that_one_diverges_alone(sims, qpos, qvel)
 
 
 def environments(

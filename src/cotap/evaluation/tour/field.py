@@ -20,6 +20,8 @@ class Row(NamedTuple):
     energy_kj: tuple[float | None, float | None] = (None, None)
 
 
+ROBOT = "g1"
+"""Whose policies these are."""
 FIELD = (
     Row("gr00t_wbc, torso at 0.66 m", (85.2, 82.9), (80, 72), (17, 51), (8, 9), (7.3, 9.1)),
     Row("decoupled_wbc, torso at 0.66 m, pitch 0.12", (83.9, 81.5), (75, 68), (10, 20), (7, 6), (5.9, 13.1)),
@@ -54,7 +56,7 @@ def beside_the_field(result: dict[str, Any]) -> str:
     """A result among the published figures; empty if it is of another robot, or not of the whole tour."""
     settings = result["settings"]
     whole = (settings["episode_seconds"], settings["waypoints"], settings["force_size"]) == (90.0, 18, 500.0)
-    if settings["env"]["robot"] != "g1" or not whole:
+    if settings["env"]["robot"] != ROBOT or not whole:
         return ""
     note = "Published figures: MuJoCo / PhysX, by https://github.com/rhoyn/teleop-walking-benchmark"
     return f"{field_table(result)}\n\n{note}."

@@ -16,8 +16,7 @@ _ANGLES = {
     "hip_pitch": -0.312, "knee": 0.669, "ankle": -0.363, "ankle_roll": 0.0,
     "shoulder_pitch": 0.2, "shoulder_roll": 0.2, "elbow": 0.6,
 }  # fmt: skip
-# Reflected inertias of the G1's arm motors [kg m^2], and what gains are made of them.
-_G1_INERTIA = {"shoulder": 0.003610, "elbow": 0.003610, "wrist": 0.00425, "wrist_roll": 0.003610}
+# Gains of the arms are made of what a joint feels of its rotor.
 _NATURAL_RAD_S = 2.0 * math.pi * 10.0
 _DAMPING_RATIO = 2.0
 # The G1's heights [m]; those of other robots are as many times larger as they stand higher in the stance.
@@ -53,7 +52,8 @@ class TourStance:
 
 
 def tour_stance(spec: RobotSpec) -> TourStance:
-    """The published stance, heights and gains for the G1; the same angles, heights to scale and own gains for others.
+    """The published stance, heights and gains for the G1; for others the same angles and rule of gains, and heights to
+    scale.
 
     A chin lies 0.10 m, to scale, above the first joint of the arms.
     """
@@ -61,10 +61,8 @@ def tour_stance(spec: RobotSpec) -> TourStance:
     scale = _standing_height_m(spec, angles) / _standing_height_m(g1(), _angles(g1()))
     shoulder, _ = body_frame(spec, spec.chain(spec.arms[0].hand_body, spec.torso_body)[0].name, spec.torso_body, angles)
     arms = [spec.joint(name) for name in spec.upper_joints]
-    kp, kd = torch.tensor([(j.kp, j.kd) for j in arms]).unbind(1)
-    if spec.name == "g1":
-        inertia = torch.tensor([_G1_INERTIA[_longest(j.name, _G1_INERTIA)] for j in arms])
-        kp, kd = inertia * _NATURAL_RAD_S**2, 2.0 * _DAMPING_RATIO * inertia * _NATURAL_RAD_S
+    inertia = torch.tensor([j.armature_kg_m2 for j in arms])
+    kp, kd = inertia * _NATURAL_RAD_S**2, 2.0 * _DAMPING_RATIO * inertia * _NATURAL_RAD_S
     return TourStance(
         torch.tensor(angles, dtype=torch.float32), scale * _CRANE_M, scale * _FALLEN_M,
         float(shoulder[2]) + scale * _CHIN_M, kp, kd,
