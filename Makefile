@@ -13,7 +13,7 @@ $(STAMP): pyproject.toml constraints.txt
 	touch $(STAMP)
 
 demo: $(STAMP)
-	$(BIN)/python scripts/demo.py
+	$(BIN)/python examples/demo.py
 
 test: $(STAMP)
 	$(BIN)/ruff check .
@@ -29,4 +29,4 @@ fuzz: $(STAMP)
 
 bench: $(STAMP)
 	mkdir -p runs
-	$(BIN)/python scripts/benchmark.py --json runs/benchmark.json
+	$(BIN)/python -m benchmarks.training --json runs/benchmark.json

@@ -20,7 +20,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from benchmark import (
+
+from benchmarks.training import (
     SUBSTEPS,
     WARM_UP_STEPS,
     EnvStepping,
@@ -34,7 +35,6 @@ from benchmark import (
     rounds,
     sizes,
 )
-
 from cotap.agents.checkpoint import write_json
 from cotap.checks import require_positive_int, require_range
 from cotap.envs.randomization import Randomizer

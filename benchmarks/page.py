@@ -1,7 +1,7 @@
-"""The page of `cotap.play` in a headless browser: how fast it is, and the recording in the README.
+"""The page of `cotap play` in a headless browser: how fast it is, and the recording in the README.
 
-python scripts/play_page.py speed --viewers 2
-python scripts/play_page.py film --output docs/play.webp --picture docs/play.png
+python -m benchmarks.page speed --viewers 2
+python -m benchmarks.page film --output docs/play.webp --picture docs/play.png
 
 Needs playwright (extra `dev`) and a Chromium.
 """
@@ -147,13 +147,13 @@ class Speed:
         """Load the page as soon as somebody listens. Returns the seconds since `begin`."""
         while time.perf_counter() - begin < PATIENCE_S:
             if play.poll() is not None:
-                raise ValueError(f"cotap.play ended with exit status {play.returncode}")
+                raise ValueError(f"cotap play ended with exit status {play.returncode}")
             with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), 0.2):
                 answers = time.perf_counter() - begin
                 page.goto(f"http://127.0.0.1:{port}")
                 return answers
             time.sleep(0.02)
-        raise ValueError(f"cotap.play did not listen at port {port} within {PATIENCE_S:g} s")
+        raise ValueError(f"cotap play did not listen at port {port} within {PATIENCE_S:g} s")
 
     def _rate(self, page: Any, process: int) -> tuple[float, float]:
         """Control steps per second of wall time, and the program's processor time per step [ms]."""
@@ -327,7 +327,7 @@ def main(argv: list[str] | None = None) -> int:
         return 0 if args else 2
     try:
         kind = COMMANDS[require_one_of("command", args[0], COMMANDS.keys())]
-        print(tyro.cli(kind, args=args[1:], prog=f"play_page.py {args[0]}").run())
+        print(tyro.cli(kind, args=args[1:], prog=f"python -m benchmarks.page {args[0]}").run())
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -1,5 +1,5 @@
 """Several processes against one: throughput, learning, and what they tell each other. On a machine with nothing else
-running: `scripts/scaling.py measure` and `scripts/scaling.py count`."""
+running: `python -m benchmarks.scaling measure` and `python -m benchmarks.scaling count`."""
 
 from __future__ import annotations
 

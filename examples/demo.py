@@ -54,7 +54,7 @@ def main(argv: list[str] | None = None) -> int:
     if evaluate([*film, "--checkpoint", str(policy), "--video", str(OUT / "impact.mp4")]):
         print("no video on this machine; everything else is there")
     print(f"look at {OUT}: " + ", ".join(sorted(p.name for p in OUT.iterdir())))
-    print("and push the robot yourself: .venv/bin/python -m cotap.play, then open http://localhost:8080")
+    print("and push the robot yourself: .venv/bin/cotap play, then open http://localhost:8080")
     return 0
 
 

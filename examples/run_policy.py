@@ -40,7 +40,7 @@ class PolicyRunner:
     """Sensors, command and arm reference in, joint targets out; motors do `kp (target - q) - kd dq`, clipped.
 
     Args:
-        path: What `python -m cotap.export` wrote, of a policy with PD arms.
+        path: What `cotap export` wrote, of a policy with PD arms.
         arm_reference: (U,) where the arms' reference begins [rad]; None for the default pose.
         phase: Where the gait begins, in [0, 1).
     """

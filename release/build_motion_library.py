@@ -1,7 +1,7 @@
 """Make the motion library that the package ships, from the DeepMimic clips in the `pybullet` package's data.
 
 python -m pip install pybullet
-python scripts/build_motion_library.py [FOLDER]
+python -m release.build_motion_library [FOLDER]
 """
 
 from __future__ import annotations

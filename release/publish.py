@@ -1,6 +1,6 @@
 """Make a run's checkpoint a policy that the package ships: its weights, where they come from, and its evaluations.
 
-python scripts/publish.py runs/base/checkpoint_006104.pt h1-base
+python -m release.publish runs/base/checkpoint_006104.pt h1-base
 
 Writes NAME.pt, NAME.json and one NAME.EVALUATION.json for each of `EVALUATIONS`. No number of the policy changes.
 """

@@ -1,6 +1,6 @@
 """Energy that is drawn by leading a hand around closed paths at constant commanded stiffness, law by law.
 
-python scripts/closed_paths.py --output docs/laws
+python -m reports.closed_paths --output docs/laws
 
 Writes closed_paths.md and closed_paths.json there. Needs no policy and no physics: the pelvis is fixed, gravity is
 compensated, and the hand is led so slowly that only the spring of the law counts.

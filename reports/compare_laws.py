@@ -1,8 +1,8 @@
 """Every law of the arms side by side: the paper's Table VI and Fig. 9, and what backs its Table I.
 
-python scripts/compare_laws.py static --pelvis free --num-envs 384
-python scripts/compare_laws.py transient --num-envs 256
-python scripts/compare_laws.py properties
+python -m reports.compare_laws static --pelvis free --num-envs 384
+python -m reports.compare_laws transient --num-envs 256
+python -m reports.compare_laws properties
 
 Each writes NAME.md, NAME.json and NAME.png into `--output`.
 """
@@ -19,8 +19,6 @@ from typing import Any
 
 import torch
 import tyro
-from law_figures import draw_properties, draw_static, draw_transient
-from paper_tables import PROPERTIES, STATIC
 
 from cotap.agents.checkpoint import write_json
 from cotap.checks import require_one_of, require_range
@@ -39,6 +37,8 @@ from cotap.evaluation.static import StaticStiffness, settle
 from cotap.evaluation.wrong_model import misjudge
 from cotap.files import write_atomically
 from cotap.robots import h1
+from reports.law_figures import draw_properties, draw_static, draw_transient
+from reports.paper_tables import PROPERTIES, STATIC
 
 LOADS_N = (10.0, 30.0, 50.0)
 ROWS: dict[str, dict[str, Any]] = {
@@ -390,7 +390,7 @@ def main(argv: list[str] | None = None) -> int:
             print(f"usage: compare_laws.py TABLE [options]; tables: {', '.join(TABLES)}")
             return 0 if args else 2
         kind = TABLES[require_one_of("table", args[0], TABLES.keys())]
-        options = tyro.cli(kind, args=args[1:], prog=f"compare_laws.py {args[0]}")
+        options = tyro.cli(kind, args=args[1:], prog=f"python -m reports.compare_laws {args[0]}")
         for name in options.laws:
             require_one_of("law", name, ROWS.keys())
         require_range("stiffness", options.stiffness, 1.0, 1e5)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from kept_evaluations import kept_or_run
+from reports.kept_evaluations import kept_or_run
 
 STIFFNESS = (100, 300, 500, 800)
 ALPHA = (0.0, 0.3, 0.7, 1.0)
@@ -200,7 +200,7 @@ def main() -> int:
     lines = [
         "# What distillation did",
         "",
-        f"Written by `scripts/distillation_report.py`; policy `{options.checkpoint}`, base `{options.base}`.",
+        f"Written by `python -m reports.distillation_report`; policy `{options.checkpoint}`, base `{options.base}`.",
         "",
     ]
     lines += walking(runs, options.walking_envs, options.walking_seconds)

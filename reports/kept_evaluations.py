@@ -8,7 +8,7 @@ from typing import Any
 
 
 def kept_or_run(path: Path, arguments: list[str], checkpoint: str, threads: int, reuse: bool) -> dict[str, Any]:
-    """The result of `python -m cotap.evaluate ARGUMENTS --checkpoint CHECKPOINT`, written to `path`.
+    """The result of `cotap evaluate ARGUMENTS --checkpoint CHECKPOINT`, written to `path`.
 
     With `reuse` what `path` has is taken if it is of the same checkpoint and arguments.
     """

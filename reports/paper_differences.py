@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-from paper_page import Book, compared, fallen, slug
-from paper_tables import IMPACT, ROWS
+from reports.paper_page import Book, compared, fallen, slug
+from reports.paper_tables import IMPACT, ROWS
 
 IMPULSE_NS = 25.0
 

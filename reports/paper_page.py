@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from kept_evaluations import kept_or_run
+from reports.kept_evaluations import kept_or_run
 
 SHIPPED = {"cotap": "h1-cotap", "base": "h1-base"}
 """Policies that come with the package; those of ablations are given by `--policies`."""

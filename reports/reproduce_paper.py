@@ -11,9 +11,21 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from paper_differences import differences
-from paper_page import SHIPPED, Book, fallen, missing, number, ordering, picture, plot_curves, slug, verdict, write
-from paper_tables import ABLATION, IMPACT, LOAD, ROWS
+from reports.paper_differences import differences
+from reports.paper_page import (
+    SHIPPED,
+    Book,
+    fallen,
+    missing,
+    number,
+    ordering,
+    picture,
+    plot_curves,
+    slug,
+    verdict,
+    write,
+)
+from reports.paper_tables import ABLATION, IMPACT, LOAD, ROWS
 
 ARMS = {
     "PD, kp 100": ["--method", "pd"],
@@ -587,7 +599,11 @@ def main() -> int:
     policies = SHIPPED | {name: path for name, _, path in (text.partition("=") for text in options.policies)}
     envs = options.num_envs or (128 if options.quick else 4096)
     book = Book(out, evaluations, envs, options.threads, options.reuse, policies)
-    book.add(*HEAD.format(command=" ".join(["scripts/reproduce_paper.py", *sys.argv[1:]]), envs=book.envs).splitlines())
+    book.add(
+        *HEAD.format(
+            command=" ".join(["python -m reports.reproduce_paper", *sys.argv[1:]]), envs=book.envs
+        ).splitlines()
+    )
     for name, part in PARTS.items():
         if not options.only or name in options.only:
             part(book, options)

@@ -23,7 +23,7 @@ class Options:
     """Velocity tracking, impact, constant and periodic load, perturbations, in every engine."""
 
     policy: str
-    """What `python -m cotap.export` wrote."""
+    """What `cotap export` wrote."""
     output: str = "runs/sim_to_sim"
     """Folder for report.md, report.json and report.png; parts/ keeps what is done, and is gone on with."""
     jobs: int = 0
@@ -33,7 +33,7 @@ class Options:
 
 def main(argv: list[str] | None = None) -> int:
     """Parse, run, write. Returns the exit status: 0, or 2 for bad input."""
-    options = tyro.cli(Options, args=argv, prog="scripts/sim_to_sim.py")
+    options = tyro.cli(Options, args=argv, prog="python -m reports.sim_to_sim")
     cfg = options.comparison
     try:
         policy = OnnxPolicy(options.policy)

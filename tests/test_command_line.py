@@ -8,17 +8,17 @@ import sys
 from pathlib import Path
 
 import pytest
-from build_help import ABOUT, FILE, build
 
 import cotap
 from cotap.__main__ import main
 from cotap.command_help import Command, Option, dump_commands, load_commands, show, unknown
+from release.build_help import ABOUT, FILE, build
 
 COMMANDS = load_commands()
 
 
 def test_help_is_what_the_parsers_read():
-    assert dump_commands(build()) == FILE.read_text(encoding="utf-8"), "run scripts/build_help.py"
+    assert dump_commands(build()) == FILE.read_text(encoding="utf-8"), "run python -m release.build_help"
 
 
 def test_all_commands_are_listed_and_no_other():

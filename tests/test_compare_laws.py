@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import compare_laws
 import pytest
 import torch
 from random_policy import save_random_policy
 
 from cotap.evaluation.wrong_model import misjudged_arms
 from cotap.robots.chains import arm_model
+from reports import compare_laws
 
 
 def test_a_wrong_model_is_longer_and_heavier(spec):

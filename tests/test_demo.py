@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import demo
 import pytest
 
 from cotap.evaluate import parse
+from examples import demo
 
 
 @pytest.fixture
@@ -43,9 +43,9 @@ def test_it_ends_with_the_command_that_the_readme_has_for_the_page(monkeypatch, 
     assert demo.main([]) == 0
     out = capsys.readouterr().out
     assert "| envs that fell | 0.500 (0.400 to 0.600) | 0.500 (0.400 to 0.600) |" in out
-    command = ".venv/bin/python -m cotap.play"
+    command = ".venv/bin/cotap play"
     assert command in out.splitlines()[-1]
-    assert f"`{command}`" in (Path(__file__).parents[1] / "README.md").read_text()
+    assert f"`{command.removeprefix('.venv/bin/')}`" in (Path(__file__).parents[1] / "README.md").read_text()
 
 
 @pytest.mark.usefixtures("in_tmp_path", "shipped")

@@ -1,4 +1,4 @@
-"""Trainings that are killed and hurt in every way that `scripts/fault_injection.py` knows."""
+"""Trainings that are killed and hurt in every way that `benchmarks.fault_injection` knows."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-SCRIPT = Path(__file__).parent.parent / "scripts" / "fault_injection.py"
+SCRIPT = Path(__file__).parents[1] / "benchmarks" / "fault_injection.py"
 CAN_BE_REFUSED = {"full disk"}  # where file systems cannot be mounted
 
 

@@ -1,17 +1,17 @@
-"""scripts/publish.py: what is shipped of a checkpoint, and what stands beside it."""
+"""release.publish: what is shipped of a checkpoint, and what stands beside it."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
 
-import publish
 import pytest
 import torch
 from random_policy import save_random_policy
 
 from cotap.agents.checkpoint import load_checkpoint, save_checkpoint, sha256
 from cotap.evaluation.policy import load_policy
+from release import publish
 
 TINY = ["velocity-tracking", "--episode-seconds", "2", "--command-seconds", "1.5", "--threads", "1"]
 

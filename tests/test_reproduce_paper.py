@@ -1,4 +1,4 @@
-"""The page that scripts/reproduce_paper.py writes: verdicts, missing checkpoints, numbers as they were measured."""
+"""The page that reports.reproduce_paper writes: verdicts, missing checkpoints, numbers as they were measured."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import sys
 from pathlib import Path
 
 import pytest
-import reproduce_paper as rp
 from random_policy import save_random_policy
 
 from cotap.agents.checkpoint import sha256
+from reports import reproduce_paper as rp
 
 
 @pytest.fixture

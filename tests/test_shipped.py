@@ -8,13 +8,13 @@ from dataclasses import fields
 from typing import Any
 
 import pytest
-from publish import ENVS, EVALUATIONS
 
 from cotap.agents.checkpoint import load_checkpoint, sha256
 from cotap.configs import from_plain
 from cotap.evaluate import PROTOCOLS, evaluate
 from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.policy import load_policy, shipped_checkpoint, shipped_names
+from release.publish import ENVS, EVALUATIONS
 
 SMALL = "velocity-tracking.small"
 
@@ -30,7 +30,7 @@ def test_a_shipped_policy_is_small_and_says_where_it_comes_from(name: str):
     assert said["samples"] == content["samples"] > 0
     assert said["hours"] == pytest.approx(content["wall_seconds"] / 3600.0, abs=0.01)
     assert said["seed"] == content["config"]["training"]["seed"]
-    assert said["command"].startswith("python -m cotap.train")
+    assert said["command"].startswith(("cotap train", "python -m cotap.train"))
     assert said["commit"]
     assert said["evaluations"].keys() == EVALUATIONS.keys()
 

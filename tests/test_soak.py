@@ -1,10 +1,11 @@
-"""scripts/soak.py: what of a change in throughput is the training's own, and how sure that is."""
+"""benchmarks.soak: what of a change in throughput is the training's own, and how sure that is."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-import soak
+
+from benchmarks import soak
 
 ITERATION_S, EVERY_S, PAUSE_S = 5.0, 45.0, 2.0
 

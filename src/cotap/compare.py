@@ -1,4 +1,4 @@
-"""`python -m cotap.compare A.json B.json`: what differs between two evaluations, with intervals."""
+"""`cotap compare A.json B.json`: what differs between two evaluations, with intervals."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class CompareOptions:
 
 def main(argv: list[str] | None = None) -> int:
     """Parse, compare, report. Returns the exit status: 0, 2 for bad input, or 130 if interrupted."""
-    options = tyro.cli(CompareOptions, args=argv, prog="python -m cotap.compare")
+    options = tyro.cli(CompareOptions, args=argv, prog="cotap compare")
     try:
         from cotap.agents.checkpoint import write_json
 

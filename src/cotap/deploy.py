@@ -1,4 +1,4 @@
-"""`python -m cotap.deploy`: one robot, its policy in onnxruntime, in a physics engine of choice."""
+"""`cotap deploy`: one robot, its policy in onnxruntime, in a physics engine of choice."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class DeployOptions:
     """
 
     policy: str
-    """What `python -m cotap.export` wrote."""
+    """What `cotap export` wrote."""
     scenario: str = ""
     """Commands, forces, arm motion and laws over time (TOML)."""
     keyboard: bool = False
@@ -67,7 +67,7 @@ class DeployOptions:
 
 def main(argv: list[str] | None = None) -> int:
     """Parse, run, report. Returns the exit status: 0, or 2 for bad input."""
-    options = tyro.cli(DeployOptions, args=argv, prog="python -m cotap.deploy")
+    options = tyro.cli(DeployOptions, args=argv, prog="cotap deploy")
     try:
         deploy(options)
     except (ValueError, OSError, ModuleNotFoundError) as error:

@@ -1,4 +1,4 @@
-"""`python -m cotap.evaluate PROTOCOL`: batched evaluation from the command line."""
+"""`cotap evaluate PROTOCOL`: batched evaluation from the command line."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ PROTOCOLS: dict[str, type[Protocol]] = {
     "modulation": Modulation,
 }
 RECORDING = "recording"
-"""The protocol that simulates nothing: it measures a recording of `cotap.play`."""
+"""The protocol that simulates nothing: it measures a recording of `cotap play`."""
 
 
 @dataclass
@@ -85,7 +85,7 @@ class Options(Generic[P]):
 
 @dataclass
 class RecordingOptions:
-    """A recording of `cotap.play`, measured robot by robot; nothing is simulated."""
+    """A recording of `cotap play`, measured robot by robot; nothing is simulated."""
 
     protocol: tyro.conf.OmitArgPrefixes[RecordingProtocol]
     json: str = ""
@@ -115,12 +115,12 @@ def usage() -> str:
     for name, kind in {**PROTOCOLS, RECORDING: RecordingProtocol}.items():
         purpose, *_ = (inspect.getdoc(kind) or "").split("\n\n")
         lines.append(f"  {name:18s}{' '.join(purpose.split())}")
-    call = "python -m cotap.evaluate PROTOCOL"
+    call = "cotap evaluate PROTOCOL"
     return "\n".join([f"usage: {call} [options]", "", "protocols:", *lines, "", f"Options: {call} --help"])
 
 
 def evaluate(args: list[str]) -> dict[str, Any]:
-    """As `python -m cotap.evaluate`, for callers who want the result.
+    """As `cotap evaluate`, for callers who want the result.
 
     Raises:
         ValueError: bad input; the message names it.
@@ -134,7 +134,7 @@ def evaluate(args: list[str]) -> dict[str, Any]:
 def parse(args: list[str]) -> Options[Protocol]:
     """The options that a command line means. Raises ValueError for an unknown protocol."""
     kind = PROTOCOLS[require_one_of("protocol", args[0], (*PROTOCOLS, RECORDING))]
-    default, prog = Options(kind(), LawOptions()), f"python -m cotap.evaluate {args[0]}"
+    default, prog = Options(kind(), LawOptions()), f"cotap evaluate {args[0]}"
     options: Any = Options
     return tyro.cli(options[kind], args=args[1:], default=default, prog=prog, description=kind.__doc__)
 

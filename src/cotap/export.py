@@ -1,4 +1,4 @@
-"""`python -m cotap.export`: a checkpoint as one ONNX file."""
+"""`cotap export`: a checkpoint as one ONNX file."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class ExportOptions:
 def main(argv: list[str] | None = None) -> int:
     """Parse, export, report. Returns the exit status: 0, 2 for bad input, 1 if the file's numbers are not torch's, or
     130 for an export that was interrupted."""
-    options = tyro.cli(ExportOptions, args=argv, prog="python -m cotap.export")
+    options = tyro.cli(ExportOptions, args=argv, prog="cotap export")
     try:
         from cotap.deployment.graph import export_policy
         from cotap.evaluation.policy import default_checkpoint, find_checkpoint

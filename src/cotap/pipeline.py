@@ -1,4 +1,4 @@
-"""Both stages of training, one after the other: what `python -m cotap.train` does without a stage."""
+"""Both stages of training, one after the other: what `cotap train` does without a stage."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ RunStage = Callable[[str, list[str]], Path]
 @dataclass
 class PipelineOptions:
     """Both stages: a base policy, then its distillation under compliance. For more options:
-    `python -m cotap.train base --help`, `python -m cotap.train distill --help`."""
+    `cotap train base --help`, `cotap train distill --help`."""
 
     run_dir: str = ""
     """Where the runs go, into folders `base` and `distill`; by default runs/cotap-DATE-TIME."""
@@ -95,7 +95,7 @@ def train_both(options: PipelineOptions, run_stage: RunStage) -> Path:
 
     options.check()
     if Ranks.from_environment().size > 1:
-        raise ValueError("several processes train stage by stage: python -m cotap.train base, then distill")
+        raise ValueError("several processes train stage by stage: cotap train base, then distill")
     run_dir = Path(options.run_dir or time.strftime("runs/cotap-%Y%m%d-%H%M%S"))
     base_steps, distill_steps = options.iterations()
     if not options.resume:
@@ -177,7 +177,7 @@ def next_commands(run_dir: Path) -> str:
         return ""
     commands = (
         f"tensorboard --logdir {run_dir}",
-        f"python -m cotap.play --checkpoint {newest}",
-        f"python -m cotap.evaluate velocity-tracking --checkpoint {newest}",
+        f"cotap play --checkpoint {newest}",
+        f"cotap evaluate velocity-tracking --checkpoint {newest}",
     )
     return "\nNext:\n" + "".join(f"  {command}\n" for command in commands)

@@ -1,4 +1,4 @@
-"""`python -m cotap.train`: train policies from the command line; without a stage, both, one after the other."""
+"""`cotap train`: train policies from the command line; without a stage, both, one after the other."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def main(argv: list[str] | None = None) -> int:
     stage = args.pop(0) if args and not args[0].startswith("-") else ""
     try:
         if not stage:
-            train_both(tyro.cli(PipelineOptions, args=args, prog="python -m cotap.train"), run_stage)
+            train_both(tyro.cli(PipelineOptions, args=args, prog="cotap train"), run_stage)
             return 0
         require_one_of("stage", stage, STAGES)
         print(next_commands(run_stage(stage, args)), end="")
@@ -116,7 +116,7 @@ def main(argv: list[str] | None = None) -> int:
 def run_stage(stage: str, args: list[str]) -> Path:
     """Train one stage, of arguments as they were typed. Returns the run directory."""
     options = _parse_base(args) if stage == "base" else _parse_distill(args)
-    options.command = " ".join(["python -m cotap.train", stage, *args])
+    options.command = " ".join(["cotap train", stage, *args])
     return train_base(options) if isinstance(options, BaseOptions) else train_distill(options)
 
 
@@ -161,7 +161,7 @@ def _parse_base(args: list[str]) -> BaseOptions:
         training = BASE_RECIPES[recipe or "default"]()
     _unpin_library(args, training)
     default = BaseOptions(recipe=recipe or "default", training=training)
-    return tyro.cli(BaseOptions, args=args, default=default, prog="python -m cotap.train base")
+    return tyro.cli(BaseOptions, args=args, default=default, prog="cotap train base")
 
 
 def _parse_distill(args: list[str]) -> DistillOptions:
@@ -182,7 +182,7 @@ def _parse_distill(args: list[str]) -> DistillOptions:
         training = DISTILL_RECIPES[recipe](_config_of(base, BaseTraining))
     _unpin_library(args, training)
     default = DistillOptions(recipe=recipe, base_checkpoint=base, training=training)
-    return tyro.cli(DistillOptions, args=args, default=default, prog="python -m cotap.train distill")
+    return tyro.cli(DistillOptions, args=args, default=default, prog="cotap train distill")
 
 
 def _unpin_library(args: list[str], training: BaseTraining | DistillTraining) -> None:

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import math
-import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -26,16 +23,7 @@ from cotap.deployment.workers import Workers
 from cotap.envs.upper_body import UpperBodyConfig
 from cotap.evaluation.disturbance import ConstantLoad
 from cotap.robots import RobotSpec
-
-SCRIPT = Path(__file__).parents[2] / "scripts" / "sim_to_sim.py"
-
-
-@pytest.fixture
-def script(monkeypatch):
-    module = importlib.util.module_from_spec(found := importlib.util.spec_from_file_location("sim_to_sim", SCRIPT))
-    monkeypatch.setitem(sys.modules, "sim_to_sim", module)  # where dataclasses look for their annotations
-    found.loader.exec_module(module)
-    return module
+from reports import sim_to_sim as script
 
 
 def test_rates_of_falls_have_wilsons_interval():
@@ -123,7 +111,7 @@ def test_statics_is_jacobian_transpose_and_compliance(any_spec, any_model):
 
 
 @pytest.mark.slow
-def test_a_small_comparison_is_written_whole(shipped_file, tmp_path, monkeypatch, script):
+def test_a_small_comparison_is_written_whole(shipped_file, tmp_path, monkeypatch):
     monkeypatch.setattr(sim_to_sim, "LAWS", {"PD": "pd"})
     monkeypatch.setattr(sim_to_sim, "PERTURBATIONS", {"late": Perturbations(delay_steps=(1, 1))})
     arguments = ["--policy", str(shipped_file), "--engines", "mujoco", "--trials", "1", "--perturbed-trials", "1",
@@ -159,7 +147,7 @@ def test_trials_do_not_depend_on_the_number_of_processes(policy_file):
     assert not np.array_equal(found[0][0].qpos, found[0][1].qpos)
 
 
-def test_bad_comparisons_are_named(policy_file, script, capsys, tmp_path):
+def test_bad_comparisons_are_named(policy_file, capsys, tmp_path):
     for arguments, message in (
         (["--engines", "newton"], "engine 'newton' is unknown"),
         (["--trials", "0"], "trials must be a positive integer"),

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -13,9 +11,7 @@ import torch
 from cotap.compliance.laws import LawConfig
 from cotap.evaluation.closed_paths import circles, lead, spring_of
 from cotap.robots.chains import arm_model
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
-import closed_paths as script
+from reports import closed_paths as script
 
 SOFT = (300.0, 300.0, 300.0)
 

@@ -7,11 +7,8 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-import distillation_report  # noqa: F401 - that it can be loaded
 import pytest
 import torch
-from publish import EVALUATIONS
-from reproduce_paper import ARMS
 
 from cotap.agents.checkpoint import load_checkpoint, save_checkpoint
 from cotap.compliance.interface import ArmState, LawParameters
@@ -24,6 +21,9 @@ from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.policy import load_policy
 from cotap.evaluation.scenario import MODES
 from cotap.robots.chains import arm_model
+from release.publish import EVALUATIONS
+from reports import distillation_report  # noqa: F401 - that it can be loaded
+from reports.reproduce_paper import ARMS
 
 EVERYWHERE: dict[str, Any] = {"seed": 0, "torque_limit_scale": 1.0, "randomize": True}
 """Options of all protocols beside `num_envs`, and their defaults."""
@@ -89,7 +89,7 @@ def test_every_evaluation_can_be_filmed(protocol):
 
 
 @pytest.mark.parametrize("arguments", [*EVALUATIONS.values(), *(["impact", *law] for law in ARMS.values())])
-def test_what_the_scripts_ask_for_is_understood(arguments):
+def test_what_the_reports_ask_for_is_understood(arguments):
     options = parse([a if a != "ENVS" else "16" for a in arguments])
     options.protocol.check()
     options.laws.configure()

@@ -1,4 +1,4 @@
-"""`python -m cotap.motions`, end to end."""
+"""`cotap motions`, end to end."""
 
 from __future__ import annotations
 

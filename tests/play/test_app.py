@@ -251,7 +251,7 @@ def test_of_a_taken_port_the_error_says_what_to_do(free_port, capsys):
         with pytest.raises(PortTaken, match=f"--port {free_port + 1}"):
             open_server("127.0.0.1", free_port)
         assert main(["--port", str(free_port)]) == 2
-    assert "another cotap.play" in capsys.readouterr().err
+    assert "another cotap play" in capsys.readouterr().err
 
 
 def test_what_cannot_be_shown_is_refused_before_anything_runs(free_port, tmp_path, capsys):

@@ -218,6 +218,10 @@ def test_a_viser_that_starts_its_server_in_another_way_is_stopped_and_refused(fr
 def test_no_other_server_is_started_anywhere():
     root = Path(__file__).parents[2]
     opens = re.compile(r"ViserServer\(|create_server|start_server|\.listen\(|http\.server|socketserver|\bserve\(")
-    files = [*(root / "src").rglob("*.py"), *(root / "scripts").glob("*.py"), *(root / "examples").rglob("*.py")]
+    files = [
+        *(root / "src").rglob("*.py"),
+        *(f for p in ("benchmarks", "reports", "release") for f in (root / p).glob("*.py")),
+        *(root / "examples").rglob("*.py"),
+    ]
     found = [f.relative_to(root).as_posix() for f in files if opens.search(f.read_text())]
     assert found == ["src/cotap/play/websocket.py"]

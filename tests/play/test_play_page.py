@@ -8,8 +8,9 @@ import shutil
 import time
 from pathlib import Path
 
-import play_page
 import pytest
+
+from benchmarks import page as play_page
 
 
 @pytest.mark.parametrize(

@@ -83,9 +83,7 @@ def read_metadata(where: str, properties: Mapping[str, str]) -> PolicyMetadata:
     names = [f.name for f in fields(PolicyMetadata)]
     missing = [name for name in names if name not in properties]
     if missing:
-        raise PolicyError(
-            f"{where} lacks the metadata {', '.join(missing)}; export policies with python -m cotap.export"
-        )
+        raise PolicyError(f"{where} lacks the metadata {', '.join(missing)}; export policies with cotap export")
     values: dict[str, Any] = {}
     for name in names:
         try:

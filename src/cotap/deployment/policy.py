@@ -29,7 +29,7 @@ class OnnxPolicy:
     """Observation in, joint targets out, on one processor thread.
 
     Args:
-        path: What `python -m cotap.export` wrote.
+        path: What `cotap export` wrote.
 
     Raises:
         PolicyError: the file is missing, is not ONNX, has weights in another file or not finite, or loops, lacks

@@ -53,7 +53,7 @@ class Impact(Scenario):
     episode_seconds: float = 4.0
     """Length of the evaluation [s]."""
     per_env: bool = False
-    """Write every env's figures as well: `python -m cotap.compare` then compares env by env."""
+    """Write every env's figures as well: `cotap compare` then compares env by env."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""

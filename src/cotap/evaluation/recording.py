@@ -1,4 +1,4 @@
-"""Recordings of what happened on the page of `cotap.play`: one file to measure and to show again."""
+"""Recordings of what happened on the page of `cotap play`: one file to measure and to show again."""
 
 from __future__ import annotations
 
@@ -174,7 +174,7 @@ def _check_plain(name: str, value: Any, levels: int) -> None:
 
 @dataclass
 class RecordingProtocol:
-    """A recording of `cotap.play`, measured robot by robot; nothing is simulated."""
+    """A recording of `cotap play`, measured robot by robot; nothing is simulated."""
 
     file: str = ""
     """The recording (.npz)."""

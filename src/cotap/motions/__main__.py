@@ -1,4 +1,4 @@
-"""`python -m cotap.motions import|show`: motion data in, and to look at."""
+"""`cotap motions import|show`: motion data in, and to look at."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cotap.robots import ROBOTS
 
 
 def make_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m cotap.motions", description=__doc__)
+    parser = argparse.ArgumentParser(prog="cotap motions", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
     importer = commands.add_parser("import", description="Read motion files of any known format into one library.")
     importer.add_argument("sources", nargs="+", type=Path, metavar="SOURCE", help="files, or folders to search")

@@ -218,8 +218,6 @@ def shipped_library(spec: RobotSpec) -> MotionLibrary:
     """The library that comes with the package. Raises MotionError if there is none for this robot."""
     resource = files("cotap.motions").joinpath(_shipped_name(spec))
     if not resource.is_file():
-        raise MotionError(
-            f"no motion library is shipped for robot {spec.name!r}; import one with python -m cotap.motions"
-        )
+        raise MotionError(f"no motion library is shipped for robot {spec.name!r}; import one with cotap motions")
     with as_file(resource) as path:
         return MotionLibrary.load(path, spec)

@@ -1,4 +1,4 @@
-"""`python -m cotap.play`: a policy in the browser, to push, to lead, and to turn the stiffness of."""
+"""`cotap play`: a policy in the browser, to push, to lead, and to turn the stiffness of."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class PlayOptions:
 
 def main(argv: list[str] | None = None) -> int:
     """Open the page and run it. Returns the exit status: 0, or 2 for bad input."""
-    options = tyro.cli(PlayOptions, args=argv, prog="python -m cotap.play")
+    options = tyro.cli(PlayOptions, args=argv, prog="cotap play")
     try:
         return _run(options)
     except (ValueError, OSError) as error:

@@ -41,16 +41,16 @@ class Guard:
         """The status and the reason for which a request is refused; None if it is not."""
         host, origin = request.headers.get_all("Host"), request.headers.get_all("Origin")
         if len(host) != 1 or not self._is_ours(host[0]):
-            return HTTPStatus.FORBIDDEN, f"the page is not served at {host}; open the URL that cotap.play printed"
+            return HTTPStatus.FORBIDDEN, f"the page is not served at {host}; open the URL that cotap play printed"
         # Equal to Host, not to a fixed port: a tunnel has a port of its own.
         if origin and [o.lower() for o in origin] not in ([f"{s}://{host[0].lower()}"] for s in ("http", "https")):
             return HTTPStatus.FORBIDDEN, f"a website at {origin} may not use the page, which is at {host[0]}"
         # viser's page would take its data, and with it JavaScript to run, from wherever other parameters say.
         query = request.path.partition("?")[2]
         if query and not (self._token and _same(query, f"token={self._token}")):
-            return HTTPStatus.FORBIDDEN, "wrong parameters in the URL; open the URL that cotap.play printed"
+            return HTTPStatus.FORBIDDEN, "wrong parameters in the URL; open the URL that cotap play printed"
         if self._token and not query and not self._has_cookie(request):
-            return HTTPStatus.FORBIDDEN, "a token is missing from the URL; open the URL that cotap.play printed"
+            return HTTPStatus.FORBIDDEN, "a token is missing from the URL; open the URL that cotap play printed"
         return None
 
     def headers(self) -> dict[str, str]:

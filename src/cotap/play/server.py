@@ -50,6 +50,6 @@ def _require_free(host: str, port: int) -> None:
 
 def _advice(host: str, port: int, reason: str) -> str:
     return (
-        f"cannot open the page at {host}:{port} ({reason}). Is another cotap.play running? Take another port with "
+        f"cannot open the page at {host}:{port} ({reason}). Is another cotap play running? Take another port with "
         f"--port {port + 1 if port < 65535 else 8080}, or stop the program that has it"
     )

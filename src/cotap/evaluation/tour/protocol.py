@@ -56,7 +56,7 @@ class Tour(Protocol):
     """Time for all of them [s]."""
 
     engine: str = "mujoco"
-    """mujoco, with all runs at once, or pybullet, one run after the other in the loop of `python -m cotap.deploy`."""
+    """mujoco, with all runs at once, or pybullet, one run after the other in the loop of `cotap deploy`."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""

@@ -1,0 +1,7 @@
+"""`python -m reports`: what is here, a line or two each."""
+
+from pathlib import Path
+
+from benchmarks import list_modules
+
+print(list_modules("reports", Path(__file__).parent))
