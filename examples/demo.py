@@ -51,8 +51,8 @@ def main(argv: list[str] | None = None) -> int:
     print(table)
     print("3. One robot that is pushed while it walks and punches, arms under CoTaP, filmed")
     film = ["impact", *METHODS["cotap"], "--mode", "walking", "--motion", "punch", "--num-envs", "8"]
-    if evaluate([*film, "--checkpoint", str(policy), "--video", str(OUT / "impact.mp4")]):
-        print("no video on this machine; everything else is there")
+    if status := evaluate([*film, "--checkpoint", str(policy), "--video", str(OUT / "impact.mp4")]):
+        return status
     print(f"look at {OUT}: " + ", ".join(sorted(p.name for p in OUT.iterdir())))
     print("and push the robot yourself: .venv/bin/cotap play, then open http://localhost:8080")
     return 0

@@ -85,7 +85,7 @@ def deploy(options: DeployOptions) -> dict[str, Any]:
     from cotap.deployment.keyboard import HELP, KeyboardPilot, raw_terminal
     from cotap.deployment.policy import OnnxPolicy
     from cotap.deployment.trials import report, run_trials
-    from cotap.evaluation.render import STRIDE, render_frames, require_renderer, write_film
+    from cotap.evaluation.render import STRIDE, render_frames, write_film
 
     require_positive_int("trials", options.trials)
     require_seed("seed", options.seed)
@@ -99,8 +99,6 @@ def deploy(options: DeployOptions) -> dict[str, Any]:
         raise ValueError("--episode-seconds, --motion and --library do nothing with --scenario: it says so itself")
     if options.library and options.motion == HELD:
         raise ValueError(f"--library {options.library!r} does nothing without --motion, which names a clip")
-    if options.video:
-        require_renderer()
     policy = OnnxPolicy(options.policy)
     spec = robot_of(policy.metadata)
     scenario = load_scenario(options.scenario, spec) if options.scenario else Scenario()

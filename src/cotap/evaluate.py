@@ -146,7 +146,6 @@ def prepare(options: Options[Protocol]) -> tuple[HumanoidEnv, Policy, str]:
     from cotap.agents.checkpoint import require_layout, sha256
     from cotap.envs import HumanoidEnv
     from cotap.evaluation.policy import load_policy
-    from cotap.evaluation.render import require_renderer
     from cotap.sim import resolve_backend
 
     protocol = options.protocol
@@ -154,8 +153,6 @@ def prepare(options: Options[Protocol]) -> tuple[HumanoidEnv, Policy, str]:
     options.laws.require_free(protocol.drives)
     require_range("threads", options.threads, 0, 4096)
     require_outputs(options.json, options.plot, options.video)
-    if options.video:
-        require_renderer()
     if options.threads:
         torch.set_num_threads(options.threads)
     path = _checkpoint(options)
@@ -249,7 +246,6 @@ def pictures(args: list[str], times: tuple[float, ...], width: int = 480, height
 
     Raises:
         ValueError: bad input; the message names it.
-        RenderingUnavailable: there is no OpenGL to be had.
     """
     from cotap.evaluation.render import film_frames
 

@@ -435,18 +435,6 @@ def test_a_law_of_a_scenario_reads_its_fields(policy_file, tmp_path, capsys):
     assert "facet does not read alpha" in capsys.readouterr().err
 
 
-def test_that_there_is_no_renderer_is_found_before_the_trials(policy_file, tmp_path, capsys, monkeypatch):
-    import mujoco
-
-    def broken(*_):
-        raise RuntimeError("no GL")
-
-    monkeypatch.setattr(mujoco, "Renderer", broken)
-    monkeypatch.setattr("cotap.deployment.trials.run_trials", None)
-    assert deploy(["--policy", str(policy_file), "--video", str(tmp_path / "film.mp4")]) == 2
-    assert "cannot render here (no GL)" in capsys.readouterr().err
-
-
 def _edited(policy_file, tmp_path, name, value):
     proto = onnx.load(policy_file)
     next(p for p in proto.metadata_props if p.key == name).value = json.dumps(value)

@@ -10,10 +10,8 @@ from cotap.configs import to_plain
 from cotap.envs import HumanoidEnvConfig
 from cotap.evaluate import evaluate, main
 from cotap.evaluation.policy import load_policy, shipped_checkpoint, shipped_names
-from cotap.evaluation.render import RenderingUnavailable, open_renderer
 from cotap.evaluation.velocity_tracking import VelocityTracking
 from cotap.robots import h1
-from cotap.robots.mjcf import build_model
 
 SMALL = ["velocity-tracking", "--num-envs", "8", "--episode-seconds", "6", "--threads", "1"]
 
@@ -113,7 +111,6 @@ def test_the_video_is_of_the_laws_that_were_asked_for(
     tmp_path: Path, checkpoint: Path, monkeypatch: pytest.MonkeyPatch
 ):
     filmed = []
-    monkeypatch.setattr("cotap.evaluation.render.require_renderer", lambda: None)
     monkeypatch.setattr("cotap.evaluation.render.tour_video", lambda _path, cfg, *_: filmed.append(cfg.upper_body))
     options = ("--num-envs", "2", "--episode-seconds", "5", "--method", "cotap", "--singularity-ratio", "False")
     result = run(tmp_path, checkpoint, *options, "--video", str(tmp_path / "tour.mp4"))
@@ -125,7 +122,6 @@ def test_the_tour_is_filmed_with_the_arms_as_they_were_evaluated(
     tmp_path: Path, checkpoint: Path, monkeypatch: pytest.MonkeyPatch
 ):
     filmed = []
-    monkeypatch.setattr("cotap.evaluation.render.require_renderer", lambda: None)
     monkeypatch.setattr("cotap.evaluation.render.tour_video", lambda *args: filmed.append(args[-1]))
     options = ("--num-envs", "2", "--episode-seconds", "5", "--video", str(tmp_path / "tour.mp4"))
     run(tmp_path, checkpoint, *options)
@@ -134,24 +130,8 @@ def test_the_tour_is_filmed_with_the_arms_as_they_were_evaluated(
     assert filmed[1].tolist() == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.1, -0.2, -0.3, 0.4])
 
 
-@pytest.mark.parametrize("protocol", ["velocity-tracking", "static-stiffness", "stability"])
-def test_that_there_is_no_renderer_is_found_before_the_work(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, protocol: str
-):
-    import mujoco
-
-    def broken(*_: object) -> None:
-        raise RuntimeError("no GL")
-
-    monkeypatch.setattr(mujoco, "Renderer", broken)
-    monkeypatch.setattr("cotap.envs.HumanoidEnv", None)  # the work must not begin
-    assert main([protocol, "--video", str(tmp_path / "film.mp4")]) == 2
-    assert "cannot render here (no GL)" in capsys.readouterr().err
-
-
 def test_a_held_load_is_filmed_from_its_start(tmp_path: Path, checkpoint: Path, monkeypatch: pytest.MonkeyPatch):
     filmed = []
-    monkeypatch.setattr("cotap.evaluation.render.require_renderer", lambda: None)
     monkeypatch.setattr("cotap.evaluation.render.film_video", lambda _path, _env, film, _sheet: filmed.append(film))
     held = ["--num-envs", "2", "--settle-seconds", "2", "--threads", "1"]
     options = {
@@ -165,14 +145,3 @@ def test_a_held_load_is_filmed_from_its_start(tmp_path: Path, checkpoint: Path, 
     assert [len(film) for film in filmed] == [200, 200, 200]
     width = len(h1().joints) + 7 + 12
     assert {film.shape[1] for film in filmed} == {width}
-
-
-def test_without_a_renderer_the_message_says_what_to_do(monkeypatch: pytest.MonkeyPatch):
-    import mujoco
-
-    def broken(*_: object) -> None:
-        raise RuntimeError("no GL")
-
-    monkeypatch.setattr(mujoco, "Renderer", broken)
-    with pytest.raises(RenderingUnavailable, match="MUJOCO_GL=osmesa"):
-        open_renderer(build_model(h1()), 64, 64)

@@ -54,7 +54,6 @@ def test_a_punch_is_an_arrow_at_the_joint_for_a_moment(any_spec, any_model):
 @pytest.mark.parametrize("force", ["0", "500"])
 def test_the_first_run_is_filmed_to_its_end(checkpoint, tmp_path, monkeypatch, force):
     filmed = []
-    monkeypatch.setattr("cotap.evaluation.render.require_renderer", lambda: None)
     monkeypatch.setattr("cotap.evaluation.render.film_video", lambda *args: filmed.append(args))
     options = ["--episode-seconds", "1.2", "--waypoints", "2", "--threads", "1", "--force-size", force]
     evaluate(["tour", "--checkpoint", str(checkpoint), "--num-envs", "2", "--video", str(tmp_path / "t.mp4"), *options])

@@ -98,7 +98,8 @@ class PeriodicLoad(Scenario):
         height.set(xlabel="time since the load set in [s]", ylabel="hand height less reference [m]")
         for axis in (torque, height):
             axis.grid(alpha=0.2)
-            axis.legend(frameon=False, fontsize=8, ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+            if curves["time"]:
+                axis.legend(frameon=False, fontsize=8, ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0))
         save_figure(figure, path)
 
 

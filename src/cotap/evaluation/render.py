@@ -4,7 +4,6 @@ from __future__ import annotations
 
 # MuJoCo's extension module has no type stubs.
 # pyright: reportAttributeAccessIssue=false
-import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -16,10 +15,10 @@ from tqdm import tqdm
 from cotap.agents.actors import as_dict
 from cotap.checks import reason_of
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
+from cotap.evaluation.ray_renderer import RayRenderer
 from cotap.evaluation.rollout import PolicyFunction
 from cotap.evaluation.undisturbed import disable_disturbances
 from cotap.files import write_atomically
-from cotap.graphics import bind_opengl
 from cotap.robots import RobotSpec
 from cotap.robots.mjcf import build_model
 
@@ -38,46 +37,18 @@ STRIDE = 2
 """Control steps from one picture of a film to the next."""
 
 
-class RenderingUnavailable(OSError):
-    """This machine cannot render; the message says how to make it able."""
-
-
-def open_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Renderer:
-    """An off-screen renderer.
-
-    Raises:
-        RenderingUnavailable: there is no OpenGL to be had.
-    """
-    try:
-        bind_opengl()
-        return mujoco.Renderer(model, height, width)
-    except ValueError:  # a picture larger than the model's frame buffer: the caller's mistake, not the machine's
-        raise
-    except Exception as error:  # GLFW, EGL and OSMesa raise kinds of their own, which share no base but this
-        raise RenderingUnavailable(
-            f"cannot render here ({reason_of(error)}). Set MUJOCO_GL=egl on a machine with a GPU driver, or "
-            "install OSMesa (Debian, Ubuntu: apt-get install libosmesa6) and set MUJOCO_GL=osmesa; now MUJOCO_GL="
-            f"{os.environ.get('MUJOCO_GL', 'unset')}"
-        ) from error
-
-
-def require_renderer() -> None:
-    """Find out before the work, rather than after it, that there is no OpenGL. Raises RenderingUnavailable."""
-    open_renderer(mujoco.MjSpec().compile(), 16, 16).close()
-
-
 def render_frames(
     spec: RobotSpec, qpos: torch.Tensor, width: int = 640, height: int = 480, camera: str = "track"
 ) -> Iterator[np.ndarray]:
     """Images (height, width, 3) uint8 of the configurations `qpos` (T, nq)."""
     model = build_model(spec)
     data = mujoco.MjData(model)
-    with open_renderer(model, width, height) as renderer:
-        for row in qpos.numpy():
-            data.qpos[:] = row
-            mujoco.mj_forward(model, data)
-            renderer.update_scene(data, camera)
-            yield renderer.render().copy()
+    renderer = RayRenderer(model, height, width)
+    for row in qpos.numpy():
+        data.qpos[:] = row
+        mujoco.mj_forward(model, data)
+        renderer.update_scene(data, camera)
+        yield renderer.render()
 
 
 Rgba = tuple[float, float, float, float]
@@ -102,19 +73,19 @@ def film_frames(
     model = build_model(env.spec, unevenness_m=env.cfg.unevenness_m)
     data = mujoco.MjData(model)
     sides = [arm.side for arm in env.spec.arms]
-    with open_renderer(model, width, height) as renderer:
-        for number, row in enumerate(film.double().numpy()):
-            data.qpos[:] = row[: model.nq]
-            mujoco.mj_forward(model, data)
-            renderer.update_scene(data, camera)
-            points, forces = row[model.nq :].reshape(2, len(sides), 3)
-            for side, point, force in zip(sides, points, forces, strict=True):
-                add_ball(renderer.scene, point, REFERENCE_RGBA)
-                if np.linalg.norm(force) > 0.0:
-                    add_force(renderer.scene, data.site(f"{side}_hand").xpos, force)
-            if mark:
-                mark(renderer.scene, data, number)
-            yield renderer.render().copy()
+    renderer = RayRenderer(model, height, width)
+    for number, row in enumerate(film.double().numpy()):
+        data.qpos[:] = row[: model.nq]
+        mujoco.mj_forward(model, data)
+        renderer.update_scene(data, camera)
+        points, forces = row[model.nq :].reshape(2, len(sides), 3)
+        for side, point, force in zip(sides, points, forces, strict=True):
+            add_ball(renderer.scene, point, REFERENCE_RGBA)
+            if np.linalg.norm(force) > 0.0:
+                add_force(renderer.scene, data.site(f"{side}_hand").xpos, force)
+        if mark:
+            mark(renderer.scene, data, number)
+        yield renderer.render()
 
 
 def add_ball(scene: mujoco.MjvScene, center: np.ndarray, rgba: Rgba, radius_m: float = 0.035) -> None:
@@ -147,11 +118,7 @@ def add_force(scene: mujoco.MjvScene, point: np.ndarray, force: np.ndarray) -> N
 def film_video(
     path: Path, env: HumanoidEnv, film: torch.Tensor, sheet: Path | None = None, mark: Mark | None = None
 ) -> None:
-    """Write a video (and a contact sheet) of a film; picture k is of its row `STRIDE` k.
-
-    Raises:
-        RenderingUnavailable: there is no OpenGL to be had.
-    """
+    """Write a video (and a contact sheet) of a film; picture k is of its row `STRIDE` k."""
     part = film[::STRIDE]
     write_film(path, film_frames(env, part, mark=mark), len(part), env.dt, sheet)
 
@@ -237,11 +204,7 @@ def tour_video(
     path: Path, cfg: HumanoidEnvConfig, policy: PolicyFunction, sheet: Path | None = None,
     arm_pose: torch.Tensor | None = None,
 ) -> None:  # fmt: skip
-    """Write a video (and a contact sheet) of the tour; see `record_tour`.
-
-    Raises:
-        RenderingUnavailable: there is no OpenGL to be had.
-    """
+    """Write a video (and a contact sheet) of the tour; see `record_tour`."""
     env, qpos = record_tour(cfg, policy, arm_pose)
     part = qpos[::STRIDE]
     write_film(path, render_frames(env.spec, part), len(part), env.dt, sheet)

@@ -114,5 +114,6 @@ def plot_tracking(path: Path, t: Trajectory, gait_period_s: float, settle_s: flo
         axis.set_xlabel(f"commanded {label}")
         axis.set_ylabel("measured")
         axis.grid(alpha=0.2)
-    axes[0].legend(loc="upper left", frameon=False)
+    if axes[0].get_legend_handles_labels()[0]:
+        axes[0].legend(loc="upper left", frameon=False)
     save_figure(figure, path)

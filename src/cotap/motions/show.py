@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from cotap.evaluation.render import RenderingUnavailable, contact_sheet, render_frames
+from cotap.evaluation.render import contact_sheet, render_frames
 from cotap.files import write_atomically
 from cotap.motions.library import FPS, MotionClip, MotionLibrary
 from cotap.motions.quality import forward_kinematics
@@ -21,21 +20,14 @@ _LARGEST_SHEET = 24
 
 
 def draw(library: MotionLibrary, spec: RobotSpec, folder: Path) -> Iterator[Path]:
-    """Write a plot of each clip and a contact sheet of them; yields what was written.
-
-    Where the machine cannot render, it says so and leaves the sheet out.
-    """
+    """Write a plot of each clip and a contact sheet of them; yields what was written."""
     folder.mkdir(parents=True, exist_ok=True)
     for clip in library.clips:
         path = folder / f"{clip.name.replace('/', '_')}.png"
         plot_clip(path, clip, spec)
         yield path
     sheet = folder / "contact_sheet.png"
-    try:
-        _sheet(sheet, library.clips[:_LARGEST_SHEET], spec)
-    except RenderingUnavailable as error:
-        print(f"no contact sheet: {error}", file=sys.stderr)
-        return
+    _sheet(sheet, library.clips[:_LARGEST_SHEET], spec)
     yield sheet
 
 
