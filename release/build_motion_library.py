@@ -1,7 +1,7 @@
 """Make the motion library that the package ships, from the DeepMimic clips in the `pybullet` package's data.
 
 python -m pip install pybullet
-python -m release.build_motion_library [FOLDER]
+python -m release.build_motion_library [FOLDER] [--robot NAME]
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import cotap
 from cotap.motions.importer import ImportResult, import_motions, table
 from cotap.motions.library import MotionClip, MotionError, MotionLibrary
 from cotap.motions.processing import mirror_clip
-from cotap.robots import h1
+from cotap.robots import ROBOTS
 
 SOURCE = "DeepMimic (Peng et al., 2018), by way of the pybullet package's data: {file}"
 LICENCE = "MIT"
@@ -39,8 +39,9 @@ def main() -> int:
     """Import, mirror, name, save, and print the table of quality."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", nargs="?", type=Path, help="pybullet_data/data/motions; by default the installed one")
+    parser.add_argument("--robot", default="h1", choices=sorted(ROBOTS))
     options = parser.parse_args()
-    spec = h1()
+    spec = ROBOTS[options.robot]()
     try:
         result = import_motions([options.folder or installed_folder()], spec, "deepmimic")
     except MotionError as error:

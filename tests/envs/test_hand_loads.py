@@ -54,7 +54,7 @@ def test_loads_hold_for_their_time(rng):
 
 
 def test_scaled_down_to_what_torques_hold_by_hand():
-    hands = loads(1, torque_share=0.8, ramp=RampConfig(0.0, 100.0))
+    hands = loads(1, torque_share=0.8, weak_joint=0.0, ramp=RampConfig(0.0, 100.0))
     hands._force_h[0] = torch.tensor([[30.0, 0.0, -40.0], [10.0, 0.0, 0.0]])
     jacobian = torch.zeros(1, 2, 3, 4)
     jacobian[0, :, 2, 3] = 0.3  # vertical force on 0.3 m of forearm: 12 Nm at the elbow
@@ -65,6 +65,18 @@ def test_scaled_down_to_what_torques_hold_by_hand():
     torch.testing.assert_close(hands.current(jacobian, limit, 100.0), expected)
     quarter = torch.tensor([[[7.5, 0.0, -10.0], [2.5, 0.0, 0.0]]])
     torch.testing.assert_close(hands.current(jacobian, limit, 25.0), quarter)
+
+
+def test_a_weak_wrist_does_not_decide():
+    hands = loads(1, torque_share=0.8, ramp=RampConfig(0.0, 1.0), weak_joint=0.25)
+    hands._force_h[0] = torch.tensor([[0.0, 0.0, -40.0]]).repeat(2, 1)
+    jacobian = torch.zeros(1, 2, 3, 2)
+    jacobian[0, :, 2, 0], jacobian[0, :, 2, 1] = 0.4, 0.2  # 16 Nm at the elbow, 8 Nm at the wrist
+    held = {
+        limit: hands.current(jacobian, torch.tensor([[25.0, limit]] * 2), 1.0)[0, 0, 2].item() for limit in (6.24, 6.26)
+    }
+    assert held[6.24] == pytest.approx(-40.0)  # the elbow could hold 20 Nm
+    assert held[6.26] == pytest.approx(-40.0 * 0.8 * 6.26 / 8.0)
 
 
 def test_never_beyond_the_torque_share(rng):
@@ -141,6 +153,11 @@ def test_arms_can_hold_what_robots_carry(make_env, robot):
     env = make_env(8, robot=robot, randomization=NOMINAL, forces=ExternalForceConfig(hand_loads=cfg))
     drive(env, 5)
     limit = {j.name: share * j.torque_limit_nm for j in env.spec.joints}
+    strong = {
+        arm.side: [n for n in arm.joints if limit[n] >= 0.25 * max(limit[m] for m in arm.joints)]
+        for arm in env.spec.arms
+    }
+    assert (len(strong["left"]) < len(env.spec.arms[0].joints)) == (robot != "h1")  # the others have weak wrists
     robots = [mujoco_of(env, i) for i in range(8)]
     drawn = env.forces.hand_loads._force_h.clone()
     heading = env.state.heading_w.clone()
@@ -150,9 +167,9 @@ def test_arms_can_hold_what_robots_carry(make_env, robot):
         for a, arm in enumerate(env.spec.arms):
             jacobian = np.zeros((3, model.nv))
             mujoco.mj_jac(model, data, jacobian, None, data.site(f"{arm.side}_hand").xpos, model.body(arm.hand_body).id)
-            dofs = [model.joint(name).dofadr[0] for name in arm.joints]
+            dofs = [model.joint(name).dofadr[0] for name in strong[arm.side]]
             torque = np.abs(jacobian[:, dofs].T @ env.hand_force_w[i, a].double().numpy())
-            used.append((torque / [limit[name] for name in arm.joints]).max())
+            used.append((torque / [limit[name] for name in strong[arm.side]]).max())
             force_h = heading[i].T @ env.hand_force_w[i, a]
             cut = float(force_h.norm() / drawn[i, a].norm())
             torch.testing.assert_close(force_h, cut * drawn[i, a], atol=1e-3, rtol=1e-3)

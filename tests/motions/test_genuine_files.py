@@ -40,6 +40,7 @@ from cotap.motions.processing import JointMotion, make_clip
 from cotap.motions.quality import assess
 from cotap.motions.reference import ClipConfig, ReferenceConfig
 from cotap.motions.rotations import heading
+from cotap.robots import ROBOTS
 
 
 def reason(path: Path, spec, **options: Any) -> str:
@@ -174,6 +175,24 @@ def test_a_robot_of_29_joints_takes_clips_of_29(tmp_path: Path, spec):
     np.testing.assert_allclose(clip.arms[::5], joints[::3, 15:], atol=1e-6)
     said = reason(tmp_path / "made.pkl", spec)
     assert said == "clip 'made': dof_pos of h1 must have shape (T, 19), got (91, 29)"
+
+
+def test_clips_of_g1_come_with_wrists_and_without(tmp_path: Path):
+    g1 = ROBOTS["g1"]()
+    joints = np.linspace(0.02, 0.3, 29) * np.sin(times_of(30.0))[:, None]  # every joint is another
+    wrists = [i for i, joint in enumerate(g1.joints) if "wrist" in joint.name]
+    upper = g1.indices(g1.upper_joints)
+    assert len(wrists) == 6
+    (tmp_path / "all.pkl").write_bytes(pickle.dumps(gmr_clip(joints=joints)))
+    np.testing.assert_allclose(imported(tmp_path / "all.pkl", g1).arms[::5], joints[::3, upper], atol=1e-6)
+    rows = np.column_stack((np.zeros((91, 6)), np.ones(91), joints))
+    np.savetxt(tmp_path / "all.csv", rows, delimiter=",")
+    np.testing.assert_allclose(imported(tmp_path / "all.csv", g1).arms[::5], joints[::3, upper], atol=1e-6)
+    (tmp_path / "few.pkl").write_bytes(pickle.dumps(gmr_clip(joints=np.delete(joints, wrists, 1))))
+    joints[:, wrists] = 0.0
+    np.testing.assert_allclose(imported(tmp_path / "few.pkl", g1).arms[::5], joints[::3, upper], atol=1e-6)
+    (tmp_path / "odd.pkl").write_bytes(pickle.dumps(gmr_clip(joints=joints[:, :22])))
+    assert reason(tmp_path / "odd.pkl", g1) == "clip 'odd': dof_pos of g1 must have shape (T, 29), got (91, 22)"
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ import pytest
 from cotap.motions import MotionClip, MotionError, MotionLibrary, shipped_library
 from cotap.motions.processing import JointMotion, limit_speed, make_clip, mirror_clip
 from cotap.motions.quality import assess, forward_kinematics
+from cotap.robots import ROBOTS
 
 # Typed from the published parameters.
 LOW = np.array([-2.87, -0.34, -1.3, -1.25, -2.87, -3.11, -4.45, -1.25])
@@ -217,14 +218,19 @@ def test_motions_that_cannot_become_clips(spec, arms, times, message):
         make_clip(spec, JointMotion("made", times, arms, np.zeros((len(arms), 3))), "made", "none")
 
 
-def test_the_shipped_library_keeps_its_promises(spec):
+@pytest.mark.parametrize("name", sorted(ROBOTS))
+def test_the_shipped_library_keeps_its_promises(name):
+    spec = ROBOTS[name]()
+    joints = [spec.joints[i] for i in spec.indices(spec.upper_joints)]
+    low, high = np.array([j.range_rad for j in joints]).T
     library = shipped_library(spec)
     assert len(library.clips) == 40
     assert {"walk", "run", "punch", "kick", "dance_a", "dance_b", "jump", "spin", "crawl"} <= set(library.names())
     for c in library.clips:
-        assert (c.arms >= LOW.astype(np.float32)).all(), c.name
-        assert (c.arms <= HIGH.astype(np.float32)).all(), c.name
-        assert (np.abs(np.diff(c.arms, axis=0)) * 50.0 <= SPEED + 1e-2).all(), c.name
+        assert (c.arms >= low.astype(np.float32)).all(), c.name
+        assert (c.arms <= high.astype(np.float32)).all(), c.name
+        speed = np.array([j.velocity_limit_rad_s for j in joints])
+        assert (np.abs(np.diff(c.arms, axis=0)) * 50.0 <= speed + 1e-2).all(), c.name
         assert c.licence == "MIT"
         assert "DeepMimic" in c.source
     originals = [c for c in library.clips if not c.mirrored]

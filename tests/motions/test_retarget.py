@@ -16,6 +16,7 @@ from cotap.motions.retarget import (
     shoulder_angles,
     upper_arm_rotation,
 )
+from cotap.robots import ROBOTS
 
 T = 200
 SIDES = ("left", "right")
@@ -60,6 +61,30 @@ def test_the_rotation_is_the_robots(spec, index):
     np.testing.assert_allclose(hand[:, index] - elbow[:, index], 0.3 * rotation[:, :, 0], atol=1e-5)
 
 
+@pytest.mark.parametrize("name", sorted(ROBOTS))
+@pytest.mark.parametrize("index", [0, 1])
+def test_upper_arm_and_forearm_are_rigid_in_the_frames_that_a_human_gives(name, index):
+    spec = ROBOTS[name]()
+    arm = spec.arms[index]
+    frames, count = arm_frames(spec, arm), len(arm.joints)
+    sign = 1.0 if index == 0 else -1.0
+    shoulders = wave(4, [-1.5, -0.2, -1.0], [1.5, 1.2, 1.2]) * [1.0, sign, sign]
+    rotation, flexion = upper_arm_rotation(frames, shoulders), wave(9, [0.2], [1.8])[:, 0]
+    rotations = {a.side: rotation for a in spec.arms}
+    motion = HumanMotion("made", np.arange(T) / 50.0, rotations, dict.fromkeys(SIDES, flexion), np.zeros((T, 3)))
+    joints = retarget(spec, motion)
+    np.testing.assert_array_equal(joints.reshape(T, 2, count)[:, :, 4:], 0.0)  # wrists rest
+    shoulder, elbow, hand, _ = forward_kinematics(spec, joints)
+    upper = np.einsum("tji,tj->ti", rotation, elbow[:, index] - shoulder[:, index])
+    np.testing.assert_allclose(upper, upper[:1].repeat(T, 0), atol=0.0125)  # G1's elbow is 6 mm off the yaw's axis
+    assert upper[0, 2] < -0.15  # an arm hangs
+    c, s, zero, one = np.cos(flexion), np.sin(flexion), np.zeros(T), np.ones(T)
+    bend = np.stack((np.stack((c, zero, -s), 1), np.stack((zero, one, zero), 1), np.stack((s, zero, c), 1)), 1)
+    forearm = np.einsum("tji,tj->ti", rotation @ bend, hand[:, index] - elbow[:, index])
+    np.testing.assert_allclose(forearm, forearm[:1].repeat(T, 0), atol=1e-4)  # G1's frames are rounded
+    assert forearm[0, 2] < -0.15  # and goes on downwards where the elbow is straight
+
+
 def test_elbow_flexion_lifts_the_forearm_forward():
     assert elbow_angle(np.array([0.0, np.pi / 2])).tolist() == pytest.approx([np.pi / 2, 0.0])
     direction = arm_direction(np.eye(3)[None].repeat(2, 0), np.array([0.0, np.pi / 2]), 1.0)
@@ -97,5 +122,5 @@ def test_an_arm_of_another_kind_is_refused(spec):
     from dataclasses import replace
 
     joints = tuple(replace(j, axis=(0.0, 0.0, 1.0)) if j.name == "left_elbow" else j for j in spec.joints)
-    with pytest.raises(ValueError, match="left arm is not shoulder pitch, roll, yaw and elbow"):
+    with pytest.raises(ValueError, match="left arm does not begin with shoulder pitch, roll, yaw and elbow"):
         arm_frames(replace(spec, joints=joints), spec.arms[0])

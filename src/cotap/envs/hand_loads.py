@@ -31,6 +31,8 @@ class HandLoadConfig:
     """Time between changes [s]."""
     torque_share: float = 0.8
     """Forces are scaled down to what this share of the arm's torque limits can hold."""
+    weak_joint: float = 0.25
+    """A joint whose torque limit is below this share of the arm's largest does not count there, such as G1's wrist."""
     ramp: RampConfig = field(default_factory=RampConfig)
     """How the share of the force grows in training."""
 
@@ -39,7 +41,7 @@ class HandLoadConfig:
         for name in ("force_x", "force_y", "force_z", "hold_s"):
             require_interval(f"hand_loads.{name}", getattr(self, name))
         require_range("hand_loads.hold_s[0]", self.hold_s[0], 0.02, 1e6)
-        for name in ("episode_share", "zero_probability", "torque_share"):
+        for name in ("episode_share", "zero_probability", "torque_share", "weak_joint"):
             require_range(f"hand_loads.{name}", getattr(self, name), 0.0, 1.0)
         self.ramp.check("hand_loads.ramp")
 
@@ -78,7 +80,7 @@ class HandLoads(Stateful):
         self._remaining_s[mask] = uniform(rng, *cfg.hold_s, n)
 
     def current(self, jacobian_h: torch.Tensor, torque_limit: torch.Tensor, samples: float) -> torch.Tensor:
-        """Forces (N, hands, 3) in the heading frame, never beyond what the arms' torque limits can hold.
+        """Forces (N, hands, 3) in the heading frame, never beyond what the arms' stronger joints can hold.
 
         Args:
             jacobian_h: (N, hands, 3, n) hand Jacobians in the heading frame.
@@ -87,5 +89,7 @@ class HandLoads(Stateful):
         """
         force = self._force_h * (self.cfg.ramp.share(samples) * self._loaded)[:, None, None]
         torque = (jacobian_h.transpose(-1, -2) @ force.unsqueeze(-1)).squeeze(-1).abs()
-        holdable = (self.cfg.torque_share * torque_limit / torque.clamp_min(1e-6)).amin(-1).clamp_max(1.0)
+        weak = torque_limit < self.cfg.weak_joint * torque_limit.amax(-1, keepdim=True)
+        limit = (self.cfg.torque_share * torque_limit).masked_fill(weak, torch.inf)
+        holdable = (limit / torque.clamp_min(1e-6)).amin(-1).clamp_max(1.0)
         return force * holdable.unsqueeze(-1)

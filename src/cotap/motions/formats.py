@@ -15,6 +15,7 @@ import numpy as np
 
 from cotap.checks import legible, quoted
 from cotap.inputs import InputError, array_names, read_text
+from cotap.motions.elbow import wrist_joints
 from cotap.motions.joblib_files import load_joblib
 from cotap.motions.library import FPS, MotionClip, MotionError, MotionLibrary, read_npz
 from cotap.motions.processing import JointMotion, check_times
@@ -70,7 +71,8 @@ def read_amass(path: Path, spec: RobotSpec, fps: float | None = None) -> Clips:
 
 
 def read_phc(path: Path, spec: RobotSpec, fps: float | None = None) -> Clips:
-    """Pickles of joint angles, by joblib or not: a dict of clips, or one clip; quaternions scalar last.
+    """Pickles of joint angles, by joblib or not: a dict of clips, or one clip; quaternions scalar last. All joints, or
+    all but the wrists', which then rest at zero.
 
     A clip is as PHC and human2humanoid have it (`dof`, `root_trans_offset`) or as GMR has it (`dof_pos`, `root_pos`).
     """
@@ -289,10 +291,22 @@ def _pickled(name: str, clip: Any, spec: RobotSpec, fps: float | None) -> JointM
         raise MotionError(f"clip {quoted(name)} lacks {missing[0]!r}")
     angles = clip[entries.joints]
     angles = angles.squeeze() if isinstance(angles, np.ndarray) else angles
-    joints = _numbers(name, f"{entries.joints} of {spec.name}", angles, len(spec.joints))
+    joints = _with_wrists(_numbers(name, f"{entries.joints} of {spec.name}", angles, at_least=1), spec)
+    joints = _numbers(name, f"{entries.joints} of {spec.name}", joints, len(spec.joints))
     position = _numbers(name, entries.position, clip[entries.position], 3)
     quaternion = _numbers(name, "root_rot", clip["root_rot"], 4)
     return _joint_motion(name, _rate(name, clip.get("fps"), fps), position, quaternion, joints, spec)
+
+
+def _with_wrists(joints: np.ndarray, spec: RobotSpec) -> np.ndarray:
+    """Angles (T, J) of joints that may lack the wrists', such as 23 of G1's 29; else `joints` as they are."""
+    wrists = set(wrist_joints(spec))
+    others = [i for i, joint in enumerate(spec.joints) if joint.name not in wrists]
+    if joints.shape[1] != len(others):
+        return joints
+    out = np.zeros((len(joints), len(spec.joints)))
+    out[:, others] = joints
+    return out
 
 
 def _lafan(path: Path, spec: RobotSpec, fps: float | None) -> JointMotion:

@@ -3,7 +3,7 @@
 A human arm is its upper arm's rotation relative to the chest and its elbow's flexion. In the torso frame used here x
 points forward, y to the left, z up; with the identity rotation the upper arm hangs down, and flexion lifts the forearm
 forward. A robot arm whose shoulder is pitch, roll, yaw and whose elbow bends about the same axis as the pitch follows
-both exactly, up to its joint limits.
+both exactly, up to its joint limits. A wrist rests at its zero, as nearly as its limits let it.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cotap.motions.elbow import elbow_index
 from cotap.robots import ArmSpec, RobotSpec
 
 
@@ -38,16 +39,18 @@ class ArmFrames:
     """Rotation of the shoulder's pitch axis about x [rad]."""
     low: np.ndarray
     high: np.ndarray
-    """Joint limits [rad]."""
+    """Limits of all joints of the arm [rad]."""
 
 
 def arm_frames(spec: RobotSpec, arm: ArmSpec) -> ArmFrames:
     """Read an arm's shoulder from the robot. Raises ValueError for an arm of another kind."""
     chain = spec.chain(arm.hand_body, spec.torso_body)
     joints = [spec.joints[i] for i in spec.indices(arm.joints)]
-    axes = [j.axis for j in joints]
-    if axes != [(0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)]:
-        raise ValueError(f"{spec.name}: {arm.side} arm is not shoulder pitch, roll, yaw and elbow; its axes are {axes}")
+    axes = [j.axis for j in joints[:4]]
+    if elbow_index(spec, arm) != 3 or axes != [(0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)]:
+        raise ValueError(
+            f"{spec.name}: {arm.side} arm does not begin with shoulder pitch, roll, yaw and elbow; its axes are {axes}"
+        )
     tilt = 2.0 * np.arctan2(chain[0].quat[1], chain[0].quat[0])
     low, high = np.array([j.range_rad for j in joints]).T
     return ArmFrames(float(tilt), low, high)
@@ -118,7 +121,8 @@ def retarget(spec: RobotSpec, motion: HumanMotion) -> np.ndarray:
     for arm in spec.arms:
         frames = arm_frames(spec, arm)
         shoulder = choose_branch(frames, shoulder_angles(frames, motion.upper_arms[arm.side]))
-        arms.append(np.column_stack((shoulder, elbow_angle(motion.flexions[arm.side]))))
+        wrist = np.clip(np.zeros((len(shoulder), 1)), frames.low[4:], frames.high[4:])
+        arms.append(np.column_stack((shoulder, elbow_angle(motion.flexions[arm.side]), wrist)))
     return np.concatenate(arms, 1)
 
 
