@@ -124,13 +124,14 @@ _Group = TypeVar("_Group")
 
 
 def reward_group(cls: type[_Group]) -> type[_Group]:
-    """Make a class of terms a dataclass of their weights; the functions are in its `TERMS`, by name."""
+    """Make a class of terms a dataclass of their weights; the functions are in its `TERMS`, by name, and so are those
+    of the group that it derives from."""
     terms = {name: value for name, value in vars(cls).items() if isinstance(value, Term)}
     for name, declared in terms.items():
         text = (declared.function.__doc__ or "").strip()
         cls.__annotations__[name] = Annotated[float, tyro.conf.arg(help=text)]
         setattr(cls, name, declared.weight)
-    cls.TERMS = terms  # pyright: ignore[reportAttributeAccessIssue]
+    cls.TERMS = getattr(cls, "TERMS", {}) | terms  # pyright: ignore[reportAttributeAccessIssue]
     return dataclass(cls)
 
 
