@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: install demo test test-slow fuzz bench
+.PHONY: install demo docs test test-slow fuzz bench
 install: $(STAMP)
 
 $(STAMP): pyproject.toml constraints.txt
@@ -14,6 +14,10 @@ $(STAMP): pyproject.toml constraints.txt
 
 demo: $(STAMP)
 	$(BIN)/python examples/demo.py
+
+docs: $(STAMP)
+	$(BIN)/mkdocs build --strict
+	@echo "open site/index.html, or run $(BIN)/mkdocs serve"
 
 test: $(STAMP)
 	$(BIN)/ruff check .
