@@ -131,7 +131,8 @@ def test_a_law_reads_what_it_is_said_to_read(name, spec, rng):
                "error": "task", "damping": "pd", "soft_gain": 60.0, "virtual_mass": 3.0, "damping_ratio": 0.3,
                "reference_share": 0.2}  # fmt: skip
     of_a_store = {"passive", "store_energy", "store_power"}  # seen once stiffness changes: tests/compliance
-    assert {*changes, *of_a_store, "sensing", "name"} == {f.name for f in fields(LawConfig)}
+    of_a_pose = {"rotational_stiffness", "characteristic_length"}  # of longer arms: likewise
+    assert {*changes, *of_a_store, *of_a_pose, "sensing", "name"} == {f.name for f in fields(LawConfig)}
     for field, value in changes.items():
         assert torch.equal(torque(), torque(**{field: value})) != reads(name, field), field
     assert READS.keys() == LAWS.keys()

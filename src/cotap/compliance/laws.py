@@ -14,6 +14,7 @@ from cotap.compliance.dynamics import critical_damping, gravity_torque, joint_in
 from cotap.compliance.fast import ArmStiffness, blended_stiffness, inverse_3x3
 from cotap.compliance.impedance import BlendedTorqueLaw
 from cotap.compliance.interface import Arms, ArmState, LawParameters, LawReport, TorqueLaw, UpperBodyLaw
+from cotap.compliance.pose_task import blended_pose_stiffness, pose_jacobian
 from cotap.compliance.stiffness import project_compliance
 
 ERRORS = ("joint", "task")
@@ -42,6 +43,11 @@ class LawConfig:
     damping: str = "critical"
     """critical: from stiffness and joint-space inertia, on the rate at which joints leave their reference. pd: the PD
     law's, on the rate of the joints (the paper; cotap)."""
+    rotational_stiffness: float = 0.0
+    """Stiffness of the hand's orientation about every axis [Nm/rad]. Above 0, the hand's task is its pose, for arms of
+    six joints or more and with the joint error; at 0 the hand may turn as it likes (cotap)."""
+    characteristic_length: float = 0.2
+    """What a radian counts as where the hand's task is its pose and singular values are compared [m] (cotap)."""
     soft_gain: float = 30.0
     """Position gain [Nm/rad] (soft-pd)."""
     virtual_mass: float = 1.0
@@ -71,6 +77,10 @@ class LawConfig:
         require_range(f"{where}.null_stiffness", self.null_stiffness, 0.1, 1e4)
         require_range(f"{where}.alpha", self.alpha, 0.0, 1.0)
         require_range(f"{where}.condition_threshold", self.condition_threshold, 1.0, 1e9)
+        require_range(f"{where}.rotational_stiffness", self.rotational_stiffness, 0.0, 1e4)
+        require_range(f"{where}.characteristic_length", self.characteristic_length, 1e-3, 1e3)
+        if self.rotational_stiffness and self.error != "joint":
+            raise ValueError(f"{where}.rotational_stiffness goes with error 'joint', got error {self.error!r}")
         require_range(f"{where}.soft_gain", self.soft_gain, 0.1, 1e4)
         require_range(f"{where}.virtual_mass", self.virtual_mass, 0.01, 1e3)
         require_range(f"{where}.damping_ratio", self.damping_ratio, 0.01, 100.0)
@@ -119,17 +129,15 @@ class CoTaPLaw:
         alike = torch.equal(arms.kp, arms.kp[:, :1].expand_as(arms.kp))
         self._gains = arms.kp[:, 0] if alike else arms.kp  # (A,), which costs less, or (A, n)
         self._damping = torch.diag_embed(arms.kd)
+        if cfg.rotational_stiffness and arms.chains.num_joints < 6:
+            raise ValueError(f"rotational_stiffness asks for arms of at least 6 joints, got {arms.chains.num_joints}")
 
     @full_precision
     def __call__(self, state: ArmState, parameters: LawParameters) -> tuple[TorqueLaw, LawReport]:
         """Gravity plus `K` times the error, minus damping."""
         n = state.position.shape[0]
-        jacobian_h = state.to_heading.unsqueeze(1) @ self._arms.chains.jacobian(state.pose)
         felt, projected = _arm_stiffness(parameters.stiffness, state.base_compliance_h)
-        pd = self._gains.expand(n, *self._gains.shape)
-        blend = blended_stiffness(
-            jacobian_h, felt, parameters.null_stiffness, pd, parameters.alpha, self._cfg.condition_threshold
-        )
+        blend = self._blend(state, felt, parameters)
         error = state.target - state.position
         if self._cfg.error == "task":
             error = self._task_error(state, blend, error)
@@ -148,6 +156,19 @@ class CoTaPLaw:
             "largest_eigenvalue": blend.eigenvalue_range[..., 1],
         }  # fmt: skip
         return TorqueLaw(state.position, feedforward, elastic, stiffness, damping), LawReport(report | held)
+
+    def _blend(self, state: ArmState, felt: torch.Tensor, parameters: LawParameters) -> ArmStiffness:
+        """Of PD and of the compliance in which the hand is as stiff as `felt`, (N, A, 3) or (N, A, 3, 3) [N/m]."""
+        n, cfg, null, alpha = state.position.shape[0], self._cfg, parameters.null_stiffness, parameters.alpha
+        if cfg.rotational_stiffness:
+            jacobian_h = pose_jacobian(state.pose, state.to_heading)
+            return blended_pose_stiffness(
+                jacobian_h, felt, cfg.rotational_stiffness, null, self._arms.kp.expand(n, -1, -1), alpha,
+                cfg.condition_threshold, cfg.characteristic_length,
+            )  # fmt: skip
+        jacobian_h = state.to_heading.unsqueeze(1) @ self._arms.chains.jacobian(state.pose)
+        pd = self._gains.expand(n, *self._gains.shape)
+        return blended_stiffness(jacobian_h, felt, null, pd, alpha, cfg.condition_threshold)
 
     def _in_force(
         self, state: ArmState, stiffness: torch.Tensor, error: torch.Tensor
@@ -214,7 +235,8 @@ LAWS: dict[str, Callable[[Arms, LawConfig], UpperBodyLaw]] = {
 }
 """Every law, by name."""
 
-_OF_COTAP = ("stiffness", "null_stiffness", "alpha", "condition_threshold", "error", "damping")
+_OF_COTAP = ("stiffness", "null_stiffness", "alpha", "condition_threshold", "error", "damping", "rotational_stiffness",
+             "characteristic_length")  # fmt: skip
 _OF_A_MASS = ("virtual_mass", "damping_ratio")
 READS: dict[str, tuple[str, ...]] = {
     "pd": (),
