@@ -17,7 +17,7 @@ demo: $(STAMP)
 
 docs: $(STAMP)
 	$(BIN)/mkdocs build --strict
-	@echo "open site/index.html, or run $(BIN)/mkdocs serve"
+	@echo "open site/index.html; for its search, run $(BIN)/mkdocs serve"
 
 test: $(STAMP)
 	$(BIN)/ruff check .

@@ -33,7 +33,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:  # noqa: ARG001
-    """Fill in the commands, and let links to files outside of docs/ lead to the site's copies of them."""
+    """Fill in titles and commands, and let links to files outside of docs/ lead to the site's copies of them."""
     source, outside, docs = Path(str(page.file.abs_src_path)).parent, _outside(), Path(config.docs_dir)
 
     def in_site(link: re.Match[str]) -> str:
@@ -43,6 +43,8 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
         return link[1] if name is None else os.path.relpath(name, Path(page.file.src_uri).parent)
 
     markdown = _LINK.sub(in_site, markdown)
+    if not markdown.startswith("#"):  # a table that a report wrote
+        markdown = f"# {page.title}\n\n{markdown}"
     return markdown.replace(COMMANDS, commands()) if COMMANDS in markdown else markdown
 
 
