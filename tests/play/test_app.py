@@ -15,10 +15,11 @@ from viser import ViserServer
 from cotap.evaluation.recording import load_recording
 from cotap.play import ROBOTS
 from cotap.play.__main__ import PlayOptions, _live, main
-from cotap.play.app import App
+from cotap.play.app import START, STOP, App
 from cotap.play.controls import Refused
 from cotap.play.forces import Push
 from cotap.play.mailbox import Record, Reset, Step
+from cotap.play.panel import STEP
 from cotap.play.plots import Plots, force_displacement
 from cotap.play.scene import Scene
 from cotap.play.server import PortTaken, open_server
@@ -77,23 +78,49 @@ def test_a_push_is_made_of_what_was_accepted_and_notices_say_what_was_not(app, n
     assert app.panel._push((0.0, 0.0, -1.0)) == Push("right", (0.0, 0.0, -600.0), 0.1)
 
 
-def test_a_control_that_does_nothing_at_present_says_so_once(app, notices):
-    for value in (0.2, 0.3, 0.4):  # a slider is many values
-        app.mailbox.set("velocity_x", value)
-        app.advance()
-    assert notices == ["forward [m/s]: the robot stands; untick stand to let it walk"]
-    app.mailbox.set("velocity_x", 0.0)
-    app.mailbox.set("stand", False)
-    app.mailbox.set("yaw_rate", 0.3)
+def shown(app, *names):
+    return [app.panel._handles[name].value for name in names]
+
+
+def test_a_velocity_ends_standing_and_standing_ends_velocities(app):
+    def ask(name, value, newest=None):
+        app.panel._handles[name].value = value if newest is None else newest
+        app.mailbox.set(name, value)
+
+    names = ("stand", "velocity_x", "velocity_y", "yaw_rate")
+    ask("velocity_x", 0.3, newest=0.35)  # a slider is many values: the newest stays, though it is still on its way
     app.advance()
-    assert len(notices) == 1
+    assert app.session.values["velocity_x"] == 0.3
+    assert shown(app, *names) == [False, 0.35, 0.0, 0.0]
+    ask("yaw_rate", 0.2)
+    app.advance()
+    ask("stand", True)
+    app.advance()
+    assert shown(app, *names) == [True, 0.0, 0.0, 0.0]
+    assert app.session.env.commands.asked_to_stand.all()
+    ask("velocity_x", 0.3)
+    ask("stand", True)
+    app.advance()
+    assert shown(app, *names) == [True, 0.0, 0.0, 0.0]
+
+
+def test_what_does_nothing_at_present_is_grey(app):
+    def grey():
+        app.panel.grey(app.without_effect())
+        return {name for name, handle in app.panel._handles.items() if handle.disabled}
+
+    stiffness = {f"a.left.{part}" for part in ("stiffness_x", "stiffness_y", "stiffness_z", "alpha", "passive")}
+    assert grey() >= {STEP, STOP}
+    assert not grey() & {*stiffness, "speed", START}
     app.mailbox.set("a.left.law", "pd")
-    app.mailbox.set("a.left.alpha", 0.4)
-    app.mailbox.set("a.right.alpha", 0.4)
+    app.mailbox.set("paused", True)
+    app.mailbox.ask(Record(True))
     app.advance()
-    app.mailbox.set("a.left.stiffness_x", 400.0)
+    assert grey() >= {*stiffness, "speed", START}
+    assert not grey() & {"a.right.alpha", "a.left.law", STEP, STOP}
+    app.mailbox.set("a.left.law", "cotap")
     app.advance()
-    assert notices[1:] == ["alpha does nothing under pd", "K_ee x [N/m] does nothing under pd"]
+    assert not grey() & stiffness
 
 
 def test_a_drag_out_of_reach_gets_one_notice(app, notices):

@@ -166,7 +166,6 @@ def test_an_arm_is_made_passive_and_its_store_is_shown(session):
     assert np.isfinite(sample["store_energy"]).tolist() == [[True, False], [False, False]]
     assert sample["store_energy"][0, LEFT] == pytest.approx(2.0)
     assert sample["held_back"][0, LEFT] == 0.0
-    assert session.without_effect("b.left.passive") == "passive (energy store) does nothing under pd"
     session.set({"a.left.law": "pd"})
     assert np.isnan(run(session, 1)[-1]["store_energy"]).all()
     assert session.set({"b.left.law": "cotap"}) == []

@@ -16,14 +16,16 @@ from cotap.play.forces import Push
 from cotap.play.mailbox import Mailbox, Record, Reset, Step
 from cotap.play.notices import Notices
 from cotap.play.pace import Pace
-from cotap.play.panel import Panel
+from cotap.play.panel import STEP, Panel
 from cotap.play.plots import Plots, plots_tab
 from cotap.play.recorder import Recorder
+from cotap.play.rules import consistent, without_effect
 from cotap.play.sample import Sample
 from cotap.play.scene import Scene
 from cotap.play.session import Session
 
 DRAW_HZ, PLOT_HZ, STATUS_HZ = 25.0, 4.0, 2.0
+START, STOP = "Start recording", "Stop and save"
 PLOTS_AFTER_S = 1.5
 """The robot and its controls come first; a browser takes half a second to make the plots [s]."""
 
@@ -49,7 +51,6 @@ class App:
         self._recorder: Recorder | None = None
         self._changes: dict[str, Any] = {}
         self._noticed: set[str] = set()
-        self._idle: set[str] = set()
         self._latest: tuple[int, Sample] | None = None
         with server.atomic():
             self.panel = Panel(server, self.mailbox, session.sides, self.notices)
@@ -76,14 +77,15 @@ class App:
         """One turn of the simulation's loop: take the mail, then step, or wait where there is nothing to do."""
         values, requests = self.mailbox.take()
         before = dict(self.session.values)
-        notices = self.session.set(values)
-        changes = {name: value for name, value in self.session.values.items() if value != before[name]}
+        asked = consistent(values)
+        notices = self.session.set(asked)
+        now = self.session.values
+        changes = {name: value for name, value in now.items() if value != before[name]}
         self._changes |= changes
-        if notices:
-            self.panel.put_back({name: self.session.values[name] for name in values if name in self.session.values})
+        # Not what people have just set themselves: the newest of a slider's many values is still to come.
+        self.panel.show({name: now[name] for name in asked if name not in values or now[name] != values[name]})
         for notice in notices:
             self.notices.tell(notice, title="not possible")
-        self._tell_without_effect(changes)
         for robot in ROBOTS:
             checkpoint = changes.get(f"{robot}.checkpoint")
             if checkpoint and (text := self.session.trained_otherwise(checkpoint)):
@@ -108,14 +110,12 @@ class App:
         self._step()
         self.pace.wait(self.session.values["speed"])
 
-    def _tell_without_effect(self, changes: dict[str, Any]) -> None:
-        """Say of a control that does nothing at present that it does; a slider's many values are told of once."""
-        if any(name == "stand" or name.endswith(".law") for name in changes):
-            self._idle.clear()
-        for name in changes:
-            if name not in self._idle and (text := self.session.without_effect(name)):
-                self._idle.add(name)
-                self.notices.tell(text, title="no effect")
+    def without_effect(self) -> set[str]:
+        """Names of the controls, and labels of the buttons, that do nothing at present."""
+        values = self.session.values
+        idle = without_effect(self.session.controls, values)
+        idle.add(START if self._recorder is not None else STOP)
+        return idle if values["paused"] and not self.archive.filming.is_set() else idle | {STEP}
 
     def _step(self) -> None:
         session = self.session
@@ -151,6 +151,7 @@ class App:
             latest = self._latest
             if latest is None:
                 continue
+            self.panel.grey(self.without_effect())
             if now >= due["status"]:
                 due["status"] = now + 1.0 / STATUS_HZ
                 self._show_status()
@@ -184,8 +185,8 @@ class App:
         with self.panel.tabs.add_tab("View"):
             self._add_view()
         with self.panel.tabs.add_tab("Record"):
-            for label, on in (("Start recording", True), ("Stop and save", False)):
-                self.panel.button(label, Record(on))
+            self.panel.button(START, Record(True))
+            self.panel.button(STOP, Record(False))
             self.archive.add_buttons(gui, self.scene)
         with plots_tab(self.server) as tab:
             self._live_plots = gui.add_checkbox("live", True)

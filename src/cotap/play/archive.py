@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +35,7 @@ class Archive:
         """Held by whoever draws: a page's loop for one picture, a film until it is done."""
         self._one_film = threading.Lock()
         self._downloads = RateLimit(DOWNLOAD_S)
+        self._buttons: list[viser.GuiButtonHandle] = []
 
     def keep(self, recording: Recording) -> Path:
         """Write a recording under the next free number. Raises OSError if it cannot be written."""
@@ -45,6 +45,7 @@ class Archive:
             number += 1
         recording.save(path)
         self.newest, self.path = recording, path
+        self._grey(False)
         return path
 
     def film(self, client: viser.ClientHandle, scene: Scene) -> None:
@@ -58,6 +59,7 @@ class Archive:
         path = self.path.with_suffix(".mp4")
         try:
             self.filming.set()
+            self._grey(True)
             with self.drawing:
                 film(client, scene, self.newest, path)
         except OSError as error:
@@ -67,6 +69,7 @@ class Archive:
             client.send_file_download(path.name, path.read_bytes())
         finally:
             self.filming.clear()
+            self._grey(False)
             self._one_film.release()
 
     def add_buttons(self, gui: viser.GuiApi, scene: Scene) -> None:
@@ -77,18 +80,19 @@ class Archive:
                 self.film(event.client, scene)
 
         def on_download(event: viser.GuiEvent[Any]) -> None:
-            if event.client is None or event.client_id is None:
+            if event.client is None or event.client_id is None or self.path is None:
                 return
-            if self.path is None:
-                self._notices.tell("record something first", event.client, "nothing to download")
-            elif not self._downloads.grants(event.client_id):
+            if not self._downloads.grants(event.client_id):
                 self._notices.tell(f"once in {DOWNLOAD_S:g} s", event.client, "it is on its way")
             else:
                 event.client.send_file_download(self.path.name, self.path.read_bytes())
 
-        _add_button(gui, "Film the recording (MP4)", on_film)
-        _add_button(gui, "Download the recording", on_download)
+        for label, act in (("Film the recording (MP4)", on_film), ("Download the recording", on_download)):
+            button = gui.add_button(label, disabled=self.newest is None)
+            button.on_click(act)
+            self._buttons.append(button)
 
-
-def _add_button(gui: viser.GuiApi, label: str, act: Callable[[viser.GuiEvent[Any]], None]) -> None:
-    gui.add_button(label).on_click(act)
+    def _grey(self, on: bool) -> None:
+        """Whether the buttons do nothing."""
+        for button in self._buttons:
+            button.disabled = on

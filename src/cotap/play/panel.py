@@ -13,6 +13,8 @@ from cotap.play.forces import Push
 from cotap.play.mailbox import Mailbox, Request, Reset, Step
 from cotap.play.notices import Notices
 
+STEP = "Step"
+"""Label of the button for a single step."""
 DIRECTIONS: dict[str, tuple[float, float, float]] = {
     "forward": (1.0, 0.0, 0.0), "backward": (-1.0, 0.0, 0.0), "left": (0.0, 1.0, 0.0), "right": (0.0, -1.0, 0.0),
     "up": (0.0, 0.0, 1.0), "down": (0.0, 0.0, -1.0),
@@ -34,6 +36,7 @@ class Panel:
         self._handles: dict[str, Any] = {}
         self._good: dict[str, Any] = {name: control.default for name, control in mailbox.controls.items()}
         self._second: list[viser.GuiFolderHandle] = []
+        self._grey: set[str] = set()
         self.status = server.gui.add_markdown("")
         self._add_time()
         self.tabs = server.gui.add_tab_group()
@@ -48,12 +51,19 @@ class Panel:
             self._add_domain()
         self._show_second(False)
 
-    def put_back(self, values: Mapping[str, Any]) -> None:
-        """Show values as the simulation has them, where it could not take what was asked for."""
+    def show(self, values: Mapping[str, Any]) -> None:
+        """Show values as the simulation has them, where that is not what people have set."""
         for name, value in values.items():
             self._good[name] = value
             if name in self._handles:
                 self._handles[name].value = value
+
+    def grey(self, names: set[str]) -> None:
+        """Grey out these controls and buttons, and no others."""
+        for name in self._grey ^ names:
+            if name in self._handles:
+                self._handles[name].disabled = name in names
+        self._grey = names
 
     def bind(self, name: str) -> Any:
         """The control called `name`, added in the present container."""
@@ -106,13 +116,14 @@ class Panel:
         async def click(event: viser.GuiEvent[Any]) -> None:
             self._ask(request(), event.client)
 
-        self._gui.add_button(label).on_click(click)
+        self._handles[label] = self._gui.add_button(label)
+        self._handles[label].on_click(click)
 
     def _add_time(self) -> None:
         with self._gui.add_folder("Time"):
             self.bind("paused")
             self.bind("speed")
-            self.button("Step", Step())
+            self.button(STEP, Step())
             self.button("Reset", Reset())
             self.bind("side_by_side")
 

@@ -71,6 +71,11 @@ class Replay:
             for n in (SPEED, self._range)
         )
         speed.on_update(self._set_speed)
+
+        async def play(event: viser.GuiEvent[Any]) -> None:
+            speed.disabled = not event.target.value
+
+        self._playing.on_update(play)
         self._time.on_update(self._seek)
         self._archive.add_buttons(gui, self.scene)
         with plots_tab(server) as tab:

@@ -24,16 +24,11 @@ from cotap.motions.reference import MIXTURE, REST, ClipConfig
 from cotap.play import ROBOTS
 from cotap.play.controls import AXES, Control, Ranges, make_controls
 from cotap.play.forces import HandForces, Push
+from cotap.play.rules import VELOCITIES
 from cotap.play.sample import Sample, take_sample
 
 DOMAIN = ("friction", "mass_scale")
 """What is a robot's own from the start, beside its laws."""
-VELOCITIES = ("velocity_x", "velocity_y", "yaw_rate")
-"""Commands that wait while robots stand."""
-LAW_FIELDS = {f"stiffness_{axis}": "stiffness" for axis in AXES} | {
-    name: name for name in ("null_stiffness", "alpha", "error", "damping", "passive")
-}
-"""Controls of an arm, with the field of its law that each sets."""
 
 
 class Session:
@@ -97,16 +92,6 @@ class Session:
                 self.values[name] = before
                 notices.append(str(error))
         return notices
-
-    def without_effect(self, name: str) -> str:
-        """Why a value does nothing at present, for people; empty if it does something."""
-        label, head, *rest = self.controls[name].label, *name.split(".")
-        if name in VELOCITIES and self.values["stand"] and self.values[name] != 0.0:
-            return f"{label}: the robot stands; untick stand to let it walk"
-        if head in ROBOTS and rest[0] in self.sides and rest[1] in LAW_FIELDS:
-            law = self.values[f"{head}.{rest[0]}.law"]
-            return "" if reads(law, LAW_FIELDS[rest[1]]) else f"{label} does nothing under {law}"
-        return ""
 
     def trained_otherwise(self, checkpoint: str) -> str:
         """A notice if a checkpoint was trained with another stride than the first one, whose environment runs here."""
@@ -188,7 +173,7 @@ class Session:
             self.hand_forces.held_h[self.sides.index(side)] = force
         elif head == "motion":
             self.env.motions.lead(self.values["motion"])
-        elif head in ("velocity_x", "velocity_y", "yaw_rate", "height_offset", "stand"):
+        elif head in (*VELOCITIES, "height_offset", "stand"):
             self._command()
 
     def _apply_to_robot(self, robot: int, rest: list[str]) -> None:
