@@ -21,6 +21,7 @@ from viser._messages import GuiUpdateMessage
 
 from cotap.play import ROBOTS
 from cotap.play.app import App
+from cotap.play.rules import VELOCITIES
 from cotap.play.scene import Scene
 from cotap.play.server import open_server
 from cotap.play.session import Session
@@ -189,6 +190,72 @@ def test_a_walk_through_the_page(page: Page, tmp_path: Path):
     assert page.app.archive.newest.trajectory.fell.shape[1] == 2
     page.page.screenshot(path=tmp_path / "side_by_side.png")
     assert (tmp_path / "side_by_side.png").stat().st_size > 20_000
+    assert page.complaints == []
+
+
+def test_keys_and_a_gamepad_drive_and_what_is_let_go_stops(page: Page):
+    values = page.app.session.values
+    high = {name: page.app.session.controls[name].high for name in VELOCITIES}
+
+    def drives(what: str, x: float = 0.0, y: float = 0.0, yaw: float = 0.0, stand: bool = False) -> None:
+        shares = dict(zip(VELOCITIES, (x, y, yaw), strict=True))
+        page.until(
+            what,
+            lambda: (
+                values["stand"] is stand
+                and all(math.isclose(values[n], shares[n] * high[n], abs_tol=1e-3) for n in VELOCITIES)
+            ),
+        )
+
+    keyboard = page.page.keyboard
+    camera = next(iter(page.app.server.get_clients().values())).camera
+    page.tab("Walk")
+    before = camera.position
+    for key, axes in (("w", {"x": 0.5}), ("s", {"x": -0.5}), ("a", {"y": 0.5}), ("d", {"y": -0.5}), ("q", {"yaw": 0.5}),
+                      ("e", {"yaw": -0.5})):  # fmt: skip
+        keyboard.down(key)
+        drives(f"{key} is held", **axes)
+        keyboard.up(key)
+        drives(f"{key} is let go")
+    assert camera.position == pytest.approx(before)  # viser's keys for the camera are the same
+    keyboard.down("Shift")
+    keyboard.down("W")
+    keyboard.down("Q")
+    drives("fast, in a curve", x=1.0, yaw=1.0)
+    ahead = page.box("forward [m/s]")
+    page.until("sliders show it", lambda: float(ahead.input_value()) == pytest.approx(high["velocity_x"]))
+    page.page.wait_for_timeout(1500)
+    drives("still held", x=1.0, yaw=1.0)
+    page.page.evaluate("window.dispatchEvent(new Event('blur'))")
+    drives("another window is in front")
+    for key in ("W", "Q", "Shift"):
+        keyboard.up(key)
+    page.page.get_by_label("stand").click()
+    page.page.get_by_label("stand").click()
+    keyboard.press("Space")  # not a second click of what was clicked last
+    drives("to stand", stand=True)
+
+    ahead.focus()
+    keyboard.type("wasd ")
+    page.page.wait_for_timeout(300)
+    drives("nobody drives by typing", stand=True)
+    ahead.blur()
+
+    page.page.evaluate("""() => {
+        window.pad = {connected: true, axes: [-1, 0.1, 0, 0], buttons: [{pressed: false}]};
+        navigator.getGamepads = () => [null, window.pad]}""")
+    drives("the stick to the left", y=1.0)
+    page.page.evaluate("window.pad.axes = [0, -0.6, 0.5, 0]")
+    drives("ahead and a turn to the right", x=0.6, yaw=-0.5)
+    page.page.evaluate("window.pad.axes = [0.1, 0.1, -0.1, 0]")
+    drives("the sticks at rest")
+    page.page.evaluate("window.pad.buttons[0].pressed = true")
+    drives("its first button", stand=True)
+    page.page.evaluate("window.pad.buttons[0].pressed = false; window.pad.axes = [0, -1, 0, 0]")
+    drives("ahead", x=1.0)
+    page.page.evaluate("() => { navigator.getGamepads = () => { throw new Error('gone') } }")  # as a page that hangs
+    drives("a browser that falls silent")
+    page.complaints[:] = [text for text in page.complaints if "gone" not in text]
     assert page.complaints == []
 
 

@@ -12,6 +12,7 @@ import viser
 from cotap.play import ROBOTS
 from cotap.play.archive import Archive
 from cotap.play.controls import Refused
+from cotap.play.drive import Drive
 from cotap.play.forces import Push
 from cotap.play.mailbox import Mailbox, Record, Reset, Step
 from cotap.play.notices import Notices
@@ -22,6 +23,7 @@ from cotap.play.recorder import Recorder
 from cotap.play.rules import consistent, without_effect
 from cotap.play.sample import Sample
 from cotap.play.scene import Scene
+from cotap.play.script import add_script
 from cotap.play.session import Session
 
 DRAW_HZ, PLOT_HZ, STATUS_HZ = 25.0, 4.0, 2.0
@@ -46,6 +48,7 @@ class App:
         self.notices = Notices(server)
         self.archive = Archive(folder, self.notices)
         self.pace = Pace(session.dt)
+        self.drive = Drive(session.controls)
         self._stop = threading.Event()
         self._failure: BaseException | None = None
         self._recorder: Recorder | None = None
@@ -54,6 +57,7 @@ class App:
         self._latest: tuple[int, Sample] | None = None
         with server.atomic():
             self.panel = Panel(server, self.mailbox, session.sides, self.notices)
+            add_script(server, {"drive": self._drive})
             self._add_tabs()
         self.scene.hands.on_drag("left")(self._drag)
 
@@ -75,6 +79,7 @@ class App:
 
     def advance(self) -> None:
         """One turn of the simulation's loop: take the mail, then step, or wait where there is nothing to do."""
+        self.panel.apply(self.drive.let_go())
         values, requests = self.mailbox.take()
         before = dict(self.session.values)
         asked = consistent(values)
@@ -214,6 +219,12 @@ class App:
             "Blue wires: the stiffness asked for; orange: the effective one (30 cm for 1000 N/m). "
             f"Shapes: {scene.shapes}."
         )
+
+    def _drive(self, text: object, client: viser.ClientHandle | None) -> None:
+        try:
+            self.panel.apply(self.drive.read(text))
+        except Refused as refusal:
+            self.notices.tell(str(refusal), client, "refused")
 
     async def _drag(self, event: viser.SceneNodeDragEvent[Any]) -> None:
         index, hands = event.instance_index, len(self.session.sides)

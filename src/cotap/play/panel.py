@@ -55,8 +55,17 @@ class Panel:
         """Show values as the simulation has them, where that is not what people have set."""
         for name, value in values.items():
             self._good[name] = value
-            if name in self._handles:
+            if name in self._handles and self._handles[name].value != value:
                 self._handles[name].value = value
+        if "side_by_side" in values:
+            self._show_second(values["side_by_side"])
+
+    def apply(self, values: Mapping[str, Any]) -> None:
+        """Set controls as a hand does. Raises Refused for what cannot be; nothing is set then."""
+        clean = {name: self._mailbox.controls[name].clean(value)[0] for name, value in values.items()}
+        for name, value in clean.items():
+            self._mailbox.set(name, value)
+        self.show(clean)
 
     def grey(self, names: set[str]) -> None:
         """Grey out these controls and buttons, and no others."""
@@ -128,6 +137,7 @@ class Panel:
             self.bind("side_by_side")
 
     def _add_walk(self) -> None:
+        self._gui.add_markdown("Keys: W S, A D, Q E; shift: faster; space: stand. Or a gamepad.")
         for name in ("stand", "velocity_x", "velocity_y", "yaw_rate", "height_offset", "motion", "arm_actions"):
             self.bind(name)
 
