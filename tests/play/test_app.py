@@ -260,6 +260,28 @@ def test_a_simulation_that_fails_ends_the_program_and_says_why(app, monkeypatch)
         app.run()
 
 
+def test_a_camera_that_follows_keeps_robots_in_sight_and_one_that_does_not_finds_them_after_a_reset(app, session):
+    def seen(sample):
+        app.scene.show(sample)
+        return app.scene.hands.batched_positions[0, :2] - (sample["hand_w"][0, 0, :2] - sample["qpos"][0, :2])
+
+    def walked(sample, ahead):
+        moved = {name: value.copy() for name, value in sample.items()}
+        for name in ("qpos", "hand_w", "hand_reference_w"):
+            moved[name][..., 0] += ahead
+        return moved
+
+    sample = session.step()
+    for ahead in (0.0, 0.5, 1.0, 1.5):
+        np.testing.assert_allclose(seen(walked(sample, ahead)), 0.0, atol=1e-5)
+    app.scene.follow = False
+    np.testing.assert_allclose(seen(walked(sample, 1.5)), 0.0, atol=1e-5)  # nothing moves as it is switched off
+    np.testing.assert_allclose(seen(walked(sample, 2.0)), [0.5, 0.0], atol=1e-5)
+    np.testing.assert_allclose(seen(walked(sample, 2.8)), [1.3, 0.0], atol=1e-5)
+    np.testing.assert_allclose(seen(sample), 0.0, atol=1e-5)  # put back to where it started
+    np.testing.assert_allclose(seen(walked(sample, 0.5)), [0.5, 0.0], atol=1e-5)
+
+
 def test_the_plot_of_force_over_displacement_takes_loaded_steps_along_the_force(session):
     sample = session.step()
     loaded = {k: v.copy() for k, v in sample.items()}

@@ -18,6 +18,8 @@ if TYPE_CHECKING:  # the scene is shown before torch is there
 
 APART_M = 1.5
 """How far to its right the second robot is shown from where its own env has it [m]."""
+JUMP_M = 1.0
+"""Robots that have moved further than this between two pictures were put elsewhere [m]."""
 ELLIPSOID_M = 3e-4
 """Half axis of an ellipsoid of stiffness per stiffness [m per N/m]: 30 cm for 1000 N/m."""
 ELLIPSOID_MAX_M = 0.5
@@ -50,6 +52,7 @@ class Scene:
         self.shown = 1
         """How many robots, from the first on, are drawn; those that a sample lacks are not."""
         self.follow = True
+        """Whether the robots stay where cameras look; if not, they walk away, but are found again after a reset."""
         self.ellipsoids, self.contacts = True, True
         self._server, self._count, self._hands = server, count, len(spec.arms)
         model, self.shapes = visual_model(spec)
@@ -70,6 +73,7 @@ class Scene:
         self._contact_points = server.scene.add_point_cloud(
             "/contacts", np.zeros((1, 3)), CONTACT, point_size=0.025, point_shape="circle", visible=False
         )
+        self._middle = np.zeros(3)
         self._offset = np.zeros((count, 3))
 
     def show(self, sample: Sample) -> None:
@@ -81,9 +85,11 @@ class Scene:
         poses = [self._pose.of(qpos) for qpos in sample["qpos"]]
         apart = np.array([[0.0, -APART_M * i, 0.0] for i in range(self._count)])
         # Following moves the scene, not people's cameras: those stay theirs to turn.
-        centre = sample["qpos"][:shown, :2].mean(0) if self.follow else np.zeros(2)
-        middle = apart[:shown].mean(0) if self.follow else np.zeros(3)
-        self._offset = apart - middle - np.array([*centre, 0.0])
+        middle = apart[:shown].mean(0) + np.array([*sample["qpos"][:shown, :2].mean(0), 0.0])
+        jumped = float(np.linalg.norm(middle - self._middle)) > JUMP_M
+        self._middle = middle
+        if self.follow or jumped:
+            self._offset = apart - middle
         with self._server.atomic():
             self._floor.position = self._offset[0]
             self._robots.show_only_selected = shown < self._count
