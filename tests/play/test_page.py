@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from viser import transforms as tf
 from viser._messages import GuiUpdateMessage
 
 from cotap.play import ROBOTS
@@ -62,6 +63,17 @@ class Page:
         """That number box."""
         row = self.page.get_by_text(label, exact=True).nth(nth)
         return row.locator("xpath=ancestor::*[.//input][1]").locator("input").last
+
+    def pixel(self, point: np.ndarray) -> tuple[float, float]:
+        """Where the viewer sees a point of the scene."""
+        camera = next(iter(self.app.server.get_clients().values())).camera
+        right, down, ahead = tf.SO3(camera.wxyz).inverse() @ (np.asarray(point, np.float64) - camera.position)
+        box = self.page.locator("canvas").first.bounding_box()
+        focal = 0.5 * box["height"] / math.tan(0.5 * camera.fov)
+        return (
+            box["x"] + 0.5 * box["width"] + focal * right / ahead,
+            box["y"] + 0.5 * box["height"] + focal * down / ahead,
+        )
 
     def second_viewer(self) -> Any:
         """The same page once more in the browser."""
@@ -191,6 +203,30 @@ def test_a_walk_through_the_page(page: Page, tmp_path: Path):
     page.page.screenshot(path=tmp_path / "side_by_side.png")
     assert (tmp_path / "side_by_side.png").stat().st_size > 20_000
     assert page.complaints == []
+
+
+def test_a_hand_is_dragged_by_the_mouse_and_the_page_says_how_stiff_it_feels(page: Page):
+    page.app.mailbox.set("arm_actions", False)
+    page.app.mailbox.set("paused", True)
+    page.until("it stands still", lambda: page.app.session.values["paused"])
+    page.button("Reset")  # an untrained robot stands for a second and a half
+    page.page.wait_for_timeout(1000)
+    x, y = page.pixel(page.app.scene.hands.batched_positions[0])
+    mouse = page.page.mouse
+    mouse.move(x, y)
+    page.page.wait_for_timeout(1000)
+    mouse.down()
+    mouse.move(x + 40, y + 20, steps=4)
+    page.until("the hand is held", lambda: page.app.session.values["a.left.drag"] is not None)
+    page.app.mailbox.set("speed", 0.2)
+    page.app.mailbox.set("paused", False)
+    row = page.page.get_by_role("row").filter(has_text="left")
+    page.until("it is felt", lambda: float(row.get_by_role("cell").nth(1).inner_text().strip("()-") or 0.0) > 3.0)
+    page.until("it gives way", lambda: float(row.get_by_role("cell").nth(2).inner_text().strip("()-") or 0.0) > 0.5)
+    asked = row.get_by_role("cell").nth(4)
+    page.until("as asked for", lambda: asked.inner_text().strip("()") == "300")
+    mouse.up()
+    page.until("it is let go", lambda: page.app.session.values["a.left.drag"] is None)
 
 
 def test_keys_and_a_gamepad_drive_and_what_is_let_go_stops(page: Page):

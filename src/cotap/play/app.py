@@ -19,6 +19,7 @@ from cotap.play.notices import Notices
 from cotap.play.pace import Pace
 from cotap.play.panel import STEP, Panel
 from cotap.play.plots import Plots, plots_tab
+from cotap.play.readout import Readout
 from cotap.play.recorder import Recorder
 from cotap.play.rules import consistent, without_effect
 from cotap.play.sample import Sample
@@ -26,7 +27,7 @@ from cotap.play.scene import Scene
 from cotap.play.script import add_script
 from cotap.play.session import Session
 
-DRAW_HZ, PLOT_HZ, STATUS_HZ = 25.0, 4.0, 2.0
+DRAW_HZ, PLOT_HZ, STATUS_HZ = 25.0, 4.0, 4.0
 START, STOP = "Start recording", "Stop and save"
 PLOTS_AFTER_S = 1.5
 """The robot and its controls come first; a browser takes half a second to make the plots [s]."""
@@ -49,6 +50,7 @@ class App:
         self.archive = Archive(folder, self.notices)
         self.pace = Pace(session.dt)
         self.drive = Drive(session.controls)
+        self.readout = Readout(session.sides)
         self._stop = threading.Event()
         self._failure: BaseException | None = None
         self._recorder: Recorder | None = None
@@ -128,6 +130,7 @@ class App:
         sample = session.step()
         self._latest = (session.num_steps, sample)
         self.plots.append(session.num_steps, sample)
+        self.readout.take(sample)
         for i in range(self._shown()):
             if session.falls[i] > falls[i]:
                 self.notices.tell(f"robot {ROBOTS[i].upper()} fell and is back on its feet", title="fall")
@@ -160,6 +163,7 @@ class App:
             if now >= due["status"]:
                 due["status"] = now + 1.0 / STATUS_HZ
                 self._show_status()
+                self._show_felt()
             if not self.archive.drawing.acquire(blocking=False):
                 continue
             try:
@@ -185,6 +189,12 @@ class App:
             parts.append(f"**recording {self._recorder.seconds:.1f} s**")
         self.panel.status.content = " · ".join(parts)
 
+    def _show_felt(self) -> None:
+        felt = self.readout.table(self._shown())
+        if self.session.values["arm_actions"]:
+            felt += "\n\nThe policy moves the arms, too. Untick *policy moves arms* to feel the law alone."
+        self._felt.content = felt
+
     def _add_tabs(self) -> None:
         gui = self.server.gui
         with self.panel.tabs.add_tab("View"):
@@ -194,6 +204,7 @@ class App:
             self.panel.button(STOP, Record(False))
             self.archive.add_buttons(gui, self.scene)
         with plots_tab(self.server) as tab:
+            self._felt = gui.add_markdown("")
             self._live_plots = gui.add_checkbox("live", True)
         self.plots = Plots(self.server, tab, self.session.sides, self.session.dt)
 
