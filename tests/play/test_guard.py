@@ -85,6 +85,29 @@ def test_a_link_to_the_page_cannot_have_it_run_what_another_server_sends(server,
     assert "parameters" in text
 
 
+LINK = "/?set=robot:h1,stand:0"
+
+
+@pytest.mark.parametrize(
+    ("site", "status"),
+    [({"Sec-Fetch-Site": "none"}, 200), ({"Sec-Fetch-Site": "same-origin"}, 200),
+     ({"Sec-Fetch-Site": "cross-site"}, 403), ({"Sec-Fetch-Site": "same-site"}, 403), ({}, 403)],
+)  # fmt: skip
+def test_no_website_sets_anything_by_a_link_and_people_may_paste_one(server, site, status):
+    answered, _, text = get(server.get_port(), LINK, **site)
+    assert answered == status
+    assert ("paste it there" in text) == (status == 403)
+    assert get(server.get_port(), f"{LINK}&websocket=ws://evil.example", **site)[0] == 403
+
+
+def test_a_link_with_settings_is_no_token(open_to_all):
+    port = open_to_all.get_port()
+    assert get(port, LINK, **{"Sec-Fetch-Site": "none"})[0] == 403
+    cookie = get(port, f"/?token={TOKEN}")[1]["Set-Cookie"].partition(";")[0]
+    assert get(port, LINK, Cookie=cookie)[0] == 200
+    assert get(port, f"/?token={TOKEN}&set=robot:h1")[0] == 403
+
+
 def test_by_default_only_this_machine_reaches_it(server):
     assert PlayOptions().host == "127.0.0.1"
     assert new_token("127.0.0.1") == new_token("localhost") == ""

@@ -295,6 +295,32 @@ def test_keys_and_a_gamepad_drive_and_what_is_let_go_stops(page: Page):
     assert page.complaints == []
 
 
+def test_a_link_reproduces_settings_and_what_is_out_of_range_is_refused(page: Page):
+    values, url = page.app.session.values, page.page.url
+    page.page.goto(url + "?set=robot:h1,a.left.stiffness_x:870,velocity_x:0.35,stand:0,b.right.law:pd")
+    page.until("the link's settings", lambda: values["a.left.stiffness_x"] == 870.0 and values["b.right.law"] == "pd")
+    page.until("a walk", lambda: values["velocity_x"] == 0.35 and not values["stand"])
+    page.tab("Arms")
+    page.until("the page shows them", lambda: page.box("K_ee x [N/m]").input_value() == "870")
+    page.number("K_ee z [N/m]", 450)
+    page.tab("Record")
+    link = page.page.get_by_role("link", name="link to these settings")
+    page.until("all are linked", lambda: "a.left.stiffness_z:450" in (link.get_attribute("href") or ""))
+    link.click()
+    page.until("it is in the address bar", lambda: "a.left.stiffness_z:450" in page.page.url)
+    made = page.page.url
+    page.page.goto(url + "?set=robot:h1")
+    page.until("the defaults", lambda: values["a.left.stiffness_x"] == 300.0 and values["b.right.law"] == "cotap")
+    page.page.goto(made)
+    page.until("all that was copied", lambda: values["a.left.stiffness_z"] == 450.0 and values["velocity_x"] == 0.35)
+    assert values["a.left.stiffness_x"] == 870.0
+    before = dict(values)
+    page.page.goto(url + "?set=robot:h1,a.left.stiffness_x:9999")
+    page.page.get_by_text("K_ee x [N/m] 9999 is outside [50, 1500]; nothing was changed").first.wait_for()
+    assert values == before
+    assert page.complaints == []
+
+
 def test_a_website_cannot_use_the_page_and_a_tunnel_can(page: Page, tmp_path: Path):
     """A page of another origin tries to connect as the page itself does; then the page itself through a tunnel."""
     port = int(page.page.url.rpartition(":")[2].strip("/"))
@@ -313,6 +339,8 @@ def test_a_website_cannot_use_the_page_and_a_tunnel_can(page: Page, tmp_path: Pa
     assert stranger.evaluate("url => fetch(url).then(() => 'read', () => 'refused')", f"http://127.0.0.1:{port}") == (
         "refused"
     )
+    stranger.evaluate("url => { location = url }", f"http://127.0.0.1:{port}/?set=robot:h1,a.left.stiffness_x:870")
+    stranger.get_by_text("a link with settings works from the address bar").wait_for()
     page.until("one viewer", lambda: len(page.app.server.get_clients()) == 1)
     stranger.close()
     website.shutdown()

@@ -14,6 +14,8 @@ from cotap.play.archive import Archive
 from cotap.play.controls import Refused
 from cotap.play.drive import Drive
 from cotap.play.forces import Push
+from cotap.play.guard import PARAMETER
+from cotap.play.link import from_text, to_text
 from cotap.play.mailbox import Mailbox, Record, Reset, Step
 from cotap.play.notices import Notices
 from cotap.play.pace import Pace
@@ -59,7 +61,7 @@ class App:
         self._latest: tuple[int, Sample] | None = None
         with server.atomic():
             self.panel = Panel(server, self.mailbox, session.sides, self.notices)
-            add_script(server, {"drive": self._drive})
+            add_script(server, {"drive": self._drive, "link": self._open_link})
             self._add_tabs()
         self.scene.hands.on_drag("left")(self._drag)
 
@@ -188,6 +190,10 @@ class App:
         if self._recorder is not None:
             parts.append(f"**recording {self._recorder.seconds:.1f} s**")
         self.panel.status.content = " · ".join(parts)
+        query = f"?{PARAMETER}={to_text(s.env.spec.name, s.controls, s.values)}"
+        link = f"[Copy a link to these settings]({query}), into the address bar, too."
+        if self._link.content != link:
+            self._link.content = link
 
     def _show_felt(self) -> None:
         felt = self.readout.table(self._shown())
@@ -203,6 +209,7 @@ class App:
             self.panel.button(START, Record(True))
             self.panel.button(STOP, Record(False))
             self.archive.add_buttons(gui, self.scene)
+            self._link = gui.add_markdown("")
         with plots_tab(self.server) as tab:
             self._felt = gui.add_markdown("")
             self._live_plots = gui.add_checkbox("live", True)
@@ -236,6 +243,14 @@ class App:
             self.panel.apply(self.drive.read(text))
         except Refused as refusal:
             self.notices.tell(str(refusal), client, "refused")
+
+    def _open_link(self, text: object, client: viser.ClientHandle | None) -> None:
+        try:
+            self.panel.apply(from_text(str(text).rstrip(" "), self.session.env.spec.name, self.session.controls))
+        except Refused as refusal:
+            self.notices.tell(f"{refusal}; nothing was changed", client, "link refused")
+        else:
+            self.notices.tell("its settings are in force", client, "link")
 
     async def _drag(self, event: viser.SceneNodeDragEvent[Any]) -> None:
         index, hands = event.instance_index, len(self.session.sides)

@@ -1,4 +1,4 @@
-// What the page adds to viser's own: keys and a gamepad that drive. It opens no connection: what it has to say, it
+// What the page adds to viser's own: keys and a gamepad that drive, and links that hold settings. It opens no connection: what it has to say, it
 // types into a box of the page, as a hand would. BOXES, names of boxes by what they are for, is put before this text.
 if (window.cotap) window.cotap.abort(); // the page has connected anew
 window.cotap = new AbortController();
@@ -17,13 +17,17 @@ style.textContent = Object.values(BOXES)
 document.head.append(style);
 signal.addEventListener("abort", () => style.remove());
 
-function type(box, text) {
+function find(box) {
   let at = document.querySelector(`label[for="${box}"]`);
   while (at && !at.querySelector("input")) at = at.parentElement;
-  const input = at && at.querySelector("input");
-  if (!input) return;
+  return at && at.querySelector("input");
+}
+
+function type(box, text) {
+  const input = find(box);
+  if (!input) return false;
   Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, "value").set.call(input, text); // past React's own
-  input.dispatchEvent(new Event("input", { bubbles: true }));
+  return input.dispatchEvent(new Event("input", { bubbles: true }));
 }
 
 const held = new Set();
@@ -91,3 +95,22 @@ window.addEventListener("keyup", up, { capture: true, signal });
 window.addEventListener("blur", letGo, { signal });
 const timer = setInterval(tell, EVERY_MS);
 signal.addEventListener("abort", () => clearInterval(timer));
+
+const AGAIN_MS = 500;
+window.cotapLink ??= new URLSearchParams(location.search).get("set") ?? ""; // once, not whenever the page connects
+
+let typed = 0;
+const linking = setInterval(() => { // again and again, as it may not be heard at first; the page empties the box
+  if (typed && find(BOXES.link)?.value === "") window.cotapLink = "";
+  if (!window.cotapLink) clearInterval(linking);
+  else if (type(BOXES.link, window.cotapLink + " ".repeat(typed % 2))) typed += 1;
+}, AGAIN_MS);
+signal.addEventListener("abort", () => clearInterval(linking));
+
+document.addEventListener("click", (event) => { // without a clipboard it opens, and can be copied from there
+  const link = event.target.closest?.('a[href^="?set="]');
+  if (!link || !navigator.clipboard) return;
+  event.preventDefault();
+  navigator.clipboard.writeText(link.href);
+  history.replaceState(null, "", link.href);
+}, { signal });

@@ -15,6 +15,11 @@ HEADERS = {"Content-Security-Policy": "frame-ancestors 'none'", "X-Frame-Options
 """Of what is served: no website may show the page in a frame, and have clicks meant for itself land there."""
 _HOST = re.compile(r"(?P<name>\[[0-9a-f:.]+\]|[a-z0-9._-]+)(:[0-9]{1,5})?", re.IGNORECASE)
 
+PARAMETER = "set"
+"""Of an URL that holds settings."""
+# viser writes an URL's parameters back into it decoded; of these letters, none means anything there.
+_SETTINGS = re.compile(PARAMETER + r"=[A-Za-z0-9_.,:~-]{1,4000}")
+
 
 class Guard:
     """Tells requests of the page from those of strangers.
@@ -47,9 +52,14 @@ class Guard:
             return HTTPStatus.FORBIDDEN, f"a website at {origin} may not use the page, which is at {host[0]}"
         # viser's page would take its data, and with it JavaScript to run, from wherever other parameters say.
         query = request.path.partition("?")[2]
-        if query and not (self._token and _same(query, f"token={self._token}")):
-            return HTTPStatus.FORBIDDEN, "wrong parameters in the URL; open the URL that cotap play printed"
-        if self._token and not query and not self._has_cookie(request):
+        known = bool(self._token) and _same(query, f"token={self._token}")
+        if query and not known:
+            if not _SETTINGS.fullmatch(query):
+                return HTTPStatus.FORBIDDEN, "wrong parameters in the URL; open the URL that cotap play printed"
+            # The cookie that a page with a token asks for is not sent along from another website.
+            if not self._token and request.headers.get_all("Sec-Fetch-Site") not in (["none"], ["same-origin"]):
+                return HTTPStatus.FORBIDDEN, "a link with settings works from the address bar; paste it there"
+        if self._token and not known and not self._has_cookie(request):
             return HTTPStatus.FORBIDDEN, "a token is missing from the URL; open the URL that cotap play printed"
         return None
 

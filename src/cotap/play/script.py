@@ -26,7 +26,10 @@ def add_script(server: viser.ViserServer, hear: Mapping[str, Hear]) -> None:
 
         async def update(event: viser.GuiEvent[Any], act: Hear = act) -> None:
             if event.client_id is not None:
-                act(event.target.value, event.client)
+                text = event.target.value
+                if text:
+                    event.target.value = ""  # heard
+                    act(text, event.client)
 
         box.on_update(update)
         boxes[name] = box._impl.uuid
