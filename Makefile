@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: install demo docs test test-slow fuzz bench
+.PHONY: install demo docs test test-slow fuzz bench mutants
 install: $(STAMP)
 
 $(STAMP): pyproject.toml constraints.txt
@@ -34,3 +34,7 @@ fuzz: $(STAMP)
 bench: $(STAMP)
 	mkdir -p runs
 	$(BIN)/python -m benchmarks.training --json runs/benchmark.json
+
+mutants: $(STAMP)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[dev,mutants]"
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.mutants $(ARGS)

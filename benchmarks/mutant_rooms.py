@@ -1,0 +1,64 @@
+"""Which files are mutated, and which tests are meant to notice."""
+
+from __future__ import annotations
+
+LAWS, PASSIVE, STIFFNESS, SPD = (f"tests/compliance/test_{n}.py" for n in ("laws", "passive_law", "stiffness", "spd"))
+AUTOCAST, ADMITTANCE = (f"tests/compliance/test_{n}.py" for n in ("autocast", "admittance"))
+PASSIVITY, DYNAMICS, KINEMATICS, INVERSE, TORSO = (
+    f"tests/compliance/test_{n}.py" for n in ("passivity", "dynamics", "kinematics", "inverse_kinematics", "torso")
+)
+LOOP, STOP, ENGINES, EXPORT, ONNX_FILE = (
+    f"tests/deployment/test_{n}.py" for n in ("loop", "stop", "engines", "export", "onnx_file")
+)
+PARITY, SIM_TO_SIM, TOUR, TRIAL_ROWS = (
+    f"tests/deployment/test_{n}.py" for n in ("parity", "sim_to_sim", "tour_in_engine", "trial_rows")
+)
+
+ROOMS: dict[str, dict[str, tuple[str, ...]]] = {
+    "compliance": {
+        "src/cotap/compliance/__init__.py": (SPD,),
+        "src/cotap/compliance/admittance.py": (ADMITTANCE,),
+        "src/cotap/compliance/arguments.py": (AUTOCAST, SPD, STIFFNESS),
+        "src/cotap/compliance/arm_kinematics.py": (STIFFNESS,),
+        "src/cotap/compliance/dynamics.py": (DYNAMICS, AUTOCAST, LAWS),
+        "src/cotap/compliance/fast.py": (LAWS, STIFFNESS),
+        "src/cotap/compliance/force_estimation.py": (AUTOCAST, "tests/envs/test_hand_sensing.py"),
+        "src/cotap/compliance/geodesic.py": (PASSIVE, PASSIVITY),
+        "src/cotap/compliance/impedance.py": (LAWS, AUTOCAST),
+        "src/cotap/compliance/interface.py": (LAWS, ADMITTANCE, PASSIVE),
+        "src/cotap/compliance/inverse_kinematics.py": (INVERSE, ADMITTANCE),
+        "src/cotap/compliance/kinematics.py": (KINEMATICS, DYNAMICS),
+        "src/cotap/compliance/laws.py": (LAWS, ADMITTANCE, PASSIVE),
+        "src/cotap/compliance/passive_law.py": (PASSIVE,),
+        "src/cotap/compliance/passivity.py": (PASSIVITY,),
+        "src/cotap/compliance/spd.py": (SPD, STIFFNESS),
+        "src/cotap/compliance/stiffness.py": (STIFFNESS, LAWS),
+        "src/cotap/compliance/torso.py": (TORSO,),
+    },
+    "agents' losses": {"src/cotap/agents/losses.py": ("tests/agents/test_losses.py",)},
+    "evaluation metrics": {"src/cotap/evaluation/metrics.py": ("tests/evaluation/test_metrics.py",)},
+    "rewards": {"src/cotap/envs/rewards.py": ("tests/envs/test_rewards.py",)},
+    "deployment": {
+        "src/cotap/deployment/controller.py": (LOOP, STOP),
+        "src/cotap/deployment/engines.py": (ENGINES, STOP),
+        "src/cotap/deployment/graph.py": (EXPORT,),
+        "src/cotap/deployment/joint_law.py": (ENGINES, LOOP, STOP),
+        "src/cotap/deployment/keyboard.py": (LOOP,),
+        "src/cotap/deployment/metadata.py": (LOOP, EXPORT),
+        "src/cotap/deployment/mujoco_engine.py": (ENGINES, STOP),
+        "src/cotap/deployment/onnx_file.py": (ONNX_FILE,),
+        "src/cotap/deployment/policy.py": (ONNX_FILE, LOOP, EXPORT),
+        "src/cotap/deployment/pybullet_engine.py": (ENGINES, STOP),
+        "src/cotap/deployment/robot.py": (LOOP, STOP, PARITY),
+        "src/cotap/deployment/rotors.py": (ENGINES,),
+        "src/cotap/deployment/safety.py": (LOOP, STOP),
+        "src/cotap/deployment/scenario.py": (LOOP, STOP, SIM_TO_SIM),
+        "src/cotap/deployment/sim_to_sim.py": (SIM_TO_SIM, TRIAL_ROWS),
+        "src/cotap/deployment/terms.py": (LOOP, PARITY),
+        "src/cotap/deployment/tour.py": (TOUR,),
+        "src/cotap/deployment/trial.py": (STOP, TRIAL_ROWS, SIM_TO_SIM),
+        "src/cotap/deployment/trials.py": (LOOP, SIM_TO_SIM),
+        "src/cotap/deployment/workers.py": (SIM_TO_SIM,),
+    },
+}
+"""Tests by file, by room; the first ones listed run first, and the first that fails ends a mutant's run."""
