@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+HELP = "tests/test_command_line.py::test_help_is_what_the_parsers_read"
+"""Knows the default of every option."""
 LAWS, PASSIVE, STIFFNESS, SPD = (f"tests/compliance/test_{n}.py" for n in ("laws", "passive_law", "stiffness", "spd"))
 AUTOCAST, ADMITTANCE = (f"tests/compliance/test_{n}.py" for n in ("autocast", "admittance"))
 PASSIVITY, DYNAMICS, KINEMATICS, INVERSE, TORSO = (
@@ -28,7 +30,7 @@ ROOMS: dict[str, dict[str, tuple[str, ...]]] = {
         "src/cotap/compliance/interface.py": (LAWS, ADMITTANCE, PASSIVE),
         "src/cotap/compliance/inverse_kinematics.py": (INVERSE, ADMITTANCE),
         "src/cotap/compliance/kinematics.py": (KINEMATICS, DYNAMICS),
-        "src/cotap/compliance/laws.py": (LAWS, ADMITTANCE, PASSIVE),
+        "src/cotap/compliance/laws.py": (LAWS, ADMITTANCE, PASSIVE, HELP),
         "src/cotap/compliance/passive_law.py": (PASSIVE,),
         "src/cotap/compliance/passivity.py": (PASSIVITY,),
         "src/cotap/compliance/spd.py": (SPD, STIFFNESS),
@@ -37,7 +39,7 @@ ROOMS: dict[str, dict[str, tuple[str, ...]]] = {
     },
     "agents' losses": {"src/cotap/agents/losses.py": ("tests/agents/test_losses.py",)},
     "evaluation metrics": {"src/cotap/evaluation/metrics.py": ("tests/evaluation/test_metrics.py",)},
-    "rewards": {"src/cotap/envs/rewards.py": ("tests/envs/test_rewards.py",)},
+    "rewards": {"src/cotap/envs/rewards.py": ("tests/envs/test_rewards.py", HELP)},
     "deployment": {
         "src/cotap/deployment/controller.py": (LOOP, STOP),
         "src/cotap/deployment/engines.py": (ENGINES, STOP),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 import os
 import shutil
 import signal
@@ -12,6 +13,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from benchmarks.mutant_rules import Mutant
 
@@ -39,7 +41,7 @@ class Runner:
         """Time that a file of tests takes without a mutant [s]. Raises RuntimeError if one of them fails then."""
         if file not in self._seconds:
             begin = time.perf_counter()
-            if self._pytest((file,), 3600.0, quiet=False):
+            if self._pytest((file,), 3600.0, quiet=False) != 0:
                 raise RuntimeError(f"{file} fails without a mutant")
             self._seconds[file] = time.perf_counter() - begin
         return self._seconds[file]
@@ -81,8 +83,29 @@ class Runner:
             hole = os.open(os.devnull, os.O_WRONLY)
             os.dup2(hole, 1)
             os.dup2(hole, 2)
+        order = ShortestFirst(self._tree / "durations.json", learn=not quiet)
         options = ["-x", "-q", "-p", "no:cacheprovider", "-m", "not slow", "--hypothesis-seed=0", "-W", "ignore"]
-        return int(pytest.main([*options, *tests]))
+        return int(pytest.main([*options, *tests], plugins=[order]))
+
+
+class ShortestFirst:
+    """Plugin of pytest: in each file the shortest test comes first, for it may be enough. Learns durations, or uses."""
+
+    def __init__(self, file: Path, learn: bool) -> None:
+        self._file, self._learn = file, learn
+        self._seconds: dict[str, float] = json.loads(file.read_text()) if file.exists() else {}
+
+    def pytest_runtest_logreport(self, report: Any) -> None:
+        self._seconds[report.nodeid] = self._seconds.get(report.nodeid, 0.0) + report.duration
+
+    def pytest_sessionfinish(self) -> None:
+        if self._learn:
+            self._file.write_text(json.dumps(self._seconds))
+
+    def pytest_collection_modifyitems(self, items: list[Any]) -> None:
+        if not self._learn:
+            files = list(dict.fromkeys(item.path for item in items))
+            items.sort(key=lambda item: (files.index(item.path), self._seconds.get(item.nodeid, 0.0)))
 
 
 @contextmanager

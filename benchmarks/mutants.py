@@ -81,7 +81,7 @@ def _survivors(verdicts: dict[str, dict[Mutant, str]], room: str) -> list[Mutant
 
 
 def _verdict(runner: Runner, room: str, mutant: Mutant, known: dict[tuple[str, str, str], str]) -> str:
-    if (mutant.file, *_change(mutant)) in known:
+    if (mutant.file, *map(_without_spaces, _change(mutant))) in known:
         return EQUAL
     return KILLED if runner.killed(mutant, ROOMS[room][mutant.file]) else SURVIVED
 
@@ -97,8 +97,13 @@ def _known_equivalents() -> dict[tuple[str, str, str], str]:
         lines = {line.strip() for line in (ROOT / entry["file"]).read_text(encoding="utf-8").splitlines()}
         if entry["code"] not in lines:
             raise ValueError(f"{EQUIVALENT.name}: {entry['file']} has no line {entry['code']!r}")
-        reasons |= {(entry["file"], entry["code"], mutant): entry["reason"] for mutant in entry["mutants"]}
+        for mutant in entry["mutants"]:
+            reasons[entry["file"], _without_spaces(entry["code"]), _without_spaces(mutant)] = entry["reason"]
     return reasons
+
+
+def _without_spaces(line: str) -> str:
+    return "".join(line.split())
 
 
 def _progress(room: str, number: int, of: int, mutant: Mutant, verdict: str) -> None:

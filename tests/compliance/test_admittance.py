@@ -60,6 +60,11 @@ def test_virtual_mass_is_a_damped_oscillator(ratio, mass):
         assert np.abs(error / (force / stiffness).numpy()).max() < 1e-3
 
 
+def test_a_virtual_mass_is_of_one_kilogram_and_critically_damped_by_default():
+    x, _ = VirtualMass()(*torch.zeros(4, 1), torch.tensor([400.0]), torch.tensor([20.0]), 0.05)
+    assert float(x) == pytest.approx(float(step_response(0.05, 1.0, 400.0, 1.0, 20.0)), rel=1e-5)
+
+
 def test_virtual_mass_follows_a_moving_target_as_its_equation_says():
     """Against scipy's integrator, a target that speeds up and a force that changes from step to step."""
     mass, ratio, stiffness = 2.0, 0.6, 300.0

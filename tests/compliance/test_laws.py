@@ -164,6 +164,36 @@ def test_bad_fields_are_named(field, value):
         LawConfig(**{field: value}).check()
 
 
+@pytest.mark.parametrize(
+    ("field", "low", "high"),
+    [("null_stiffness", 0.1, 1e4), ("alpha", 0.0, 1.0), ("condition_threshold", 1.0, 1e9), ("soft_gain", 0.1, 1e4),
+     ("virtual_mass", 0.01, 1e3), ("damping_ratio", 0.01, 100.0), ("reference_share", 0.01, 0.99),
+     ("store_energy", 0.0, 1e6), ("store_power", 0.0, 1e6)],
+)  # fmt: skip
+def test_numbers_may_lie_at_their_bounds_and_not_beyond(field, low, high):
+    for bound, beyond in ((low, low - 1e-3), (high, high * 1.001)):
+        LawConfig(**{field: bound}).check()
+        with pytest.raises(ValueError, match=rf"law\.{field} must lie in"):
+            LawConfig(**{field: beyond}).check()
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_each_axis_has_bounds_on_its_stiffness(axis):
+    for bound, beyond in ((1.0, 0.999), (1e5, 1.001e5)):
+        each = [300.0, 300.0, 300.0]
+        each[axis] = bound
+        LawConfig(stiffness=tuple(each)).check()
+        each[axis] = beyond
+        with pytest.raises(ValueError, match=rf"law\.stiffness\[{axis}\] must lie in"):
+            LawConfig(stiffness=tuple(each)).check()
+
+
+def test_only_cotap_has_an_energy_store():
+    LawConfig("cotap", passive=True).check()
+    with pytest.raises(ValueError, match=r"arm\.passive: facet has no energy store"):
+        LawConfig("facet", passive=True).check("arm")
+
+
 def test_hmc_adds_torques_by_weight(arms, rng):
     state, p = a_state(arms, rng), parameters(stiffness=500.0)
     q, dq = state.position, torch.full_like(state.position, 0.7)

@@ -210,6 +210,17 @@ def test_the_fast_blend_of_different_gains_is_the_geodesic_from_pd(joints: int, 
     torch.testing.assert_close(alike.stiffness, known.stiffness, rtol=1e-5, atol=1e-4)
 
 
+@pytest.mark.parametrize("apart", [0.0, 2e-7, 1e-5, 0.03])
+def test_the_fast_blend_is_as_exact_where_eigenvalues_nearly_coincide(apart: float):
+    """Of a Jacobian that is diagonal, so is the blend: `pd^(1-a) k^a` joint by joint."""
+    own = torch.tensor([1.0, 1.0 + apart, 1.0 + 3.0 * apart], dtype=DOUBLE)
+    j = torch.cat((torch.diag(own), torch.zeros(3, 1, dtype=DOUBLE)), 1)
+    task, null, pd, alpha = (torch.tensor(x, dtype=DOUBLE) for x in ((200.0,) * 3, 30.0, 100.0, 0.4))
+    blend = blended_stiffness(j, task, null, pd, alpha).stiffness
+    expected = 100.0**0.6 * torch.cat((200.0 * own.square(), null.reshape(1))).pow(0.4)
+    torch.testing.assert_close(blend, torch.diag(expected), rtol=1e-11, atol=1e-9)
+
+
 def test_closed_forms_of_three_by_three(rng):
     a = torch.randn(500, 3, 3, dtype=DOUBLE, generator=rng)
     a = a @ a.transpose(-1, -2)

@@ -60,6 +60,17 @@ def test_hands_move_with_a_torso_that_turns():
     torch.testing.assert_close(c[0, 1], torch.diag(torch.tensor([0.0009, 0.0, 0.0])))
 
 
+def test_hands_move_as_the_body_that_a_force_on_them_turns(rng):
+    """A force f at r is a wrench (f, r x f) on the torso; what moves there by v and turns by w moves by v + w x r."""
+    torso = torch.randn(5, 6, 6, dtype=DOUBLE, generator=rng)
+    torso = torso @ torso.transpose(1, 2)
+    lever, force = torch.randn(2, 5, 2, 3, dtype=DOUBLE, generator=rng)
+    wrench = torch.cat((force, torch.linalg.cross(lever, force)), -1)
+    v, w = (torso.unsqueeze(1) @ wrench.unsqueeze(-1)).squeeze(-1).split(3, -1)
+    moved = (hand_base_compliance(torso, lever) @ force.unsqueeze(-1)).squeeze(-1)
+    torch.testing.assert_close(moved, v + torch.linalg.cross(w, lever))
+
+
 def test_support_model_against_finite_differences_of_the_legs(make_env):
     """One foot: the torso's compliance from how its pose against the sole changes with the leg's joints."""
     env = make_env(1)
