@@ -17,6 +17,7 @@ from cotap.evaluation.metrics import (
     swing_heights,
     tracking_measures,
     tracking_slopes,
+    wilson_interval,
 )
 from cotap.evaluation.report import table
 from cotap.evaluation.rollout import Trajectory, idle, record_rollout
@@ -213,6 +214,9 @@ def test_slip_counts_only_feet_in_contact():
     t.foot_speed[:, 0, 0], t.foot_speed[:, 0, 1] = 0.1, 5.0
     t.foot_contact[:, 0, 1] = False
     assert tracking_measures(t, 0.8)["foot_slip"][0] == pytest.approx(0.1, rel=1e-4)
+    t.foot_contact[:, 0] = False
+    t.foot_contact[150, 0, 1] = True  # touches down once
+    assert tracking_measures(t, 0.8)["foot_slip"].tolist() == pytest.approx([5.0, 0.0])
 
 
 def test_swing_height_is_the_mean_of_the_peaks_of_true_swings():
@@ -226,8 +230,36 @@ def test_swing_height_is_the_mean_of_the_peaks_of_true_swings():
     height[45:47, 0, 0] = 0.5
     counted = torch.ones(60, 1, dtype=torch.bool)
     assert swing_heights(height, contact, counted, 5)[0] == pytest.approx(0.08, rel=1e-5)
+    for as_long, mean in ((10, 0.08), (2, (0.1 + 0.06 + 0.5) / 3.0)):
+        assert swing_heights(height, contact, counted, as_long)[0] == pytest.approx(mean, rel=1e-5)
+    assert swing_heights(height, contact, counted, 11).isnan().all()
     counted[25:] = False
     assert swing_heights(height, contact, counted, 5)[0] == pytest.approx(0.1, rel=1e-5)
+
+
+def test_swings_count_once_a_command_to_walk_has_settled():
+    """The command holds from 2 s on, env 1 stands: of three swings, at 0.4, 2.4 and 3.4 s, the last one counts."""
+    t = trajectory()
+    t.command[100:, :, 0] = 0.1
+    t.stand[:, 1] = True
+    for begin, peak in ((20, 0.3), (120, 0.2), (170, 0.07)):
+        t.foot_contact[begin : begin + 10, :, 0] = False
+        t.foot_height[begin : begin + 10, :, 0] = peak
+    height = tracking_measures(t, 0.8)["swing_height"]
+    assert float(height[0]) == pytest.approx(0.07)
+    assert height[1].isnan()
+
+
+def test_a_command_has_settled_after_a_second_unless_told_otherwise():
+    t = trajectory(envs=2)
+    t.command[100:, :, 0] = torch.tensor([-0.5, 1.5])
+    t.velocity[:, :, 0] = t.command[:, :, 0] * torch.linspace(0.5, 1.0, 200).unsqueeze(1)
+    assert tracking_slopes(t, 0.8) == tracking_slopes(t, 0.8, settle_s=1.0) != tracking_slopes(t, 0.8, settle_s=0.98)
+    default, told, sooner = (
+        tracking_measures(t, 0.8, **k)["e_lin"] for k in ({}, {"settle_s": 1.0}, {"settle_s": 0.98})
+    )
+    assert torch.equal(default, told)
+    assert not torch.equal(default, sooner)
 
 
 def test_slopes_are_those_of_least_squares():
@@ -249,6 +281,9 @@ def test_moving_average_against_a_plain_loop():
     x = torch.randn(50, 3, generator=torch.Generator().manual_seed(1))
     expected = torch.stack([x[max(0, i - 6) : i + 1].mean(0) for i in range(50)])
     assert torch.allclose(moving_average(x, 7), expected, atol=1e-5)
+    so_far = torch.stack([x[: i + 1].mean(0) for i in range(50)])
+    for longer in (50, 80):
+        assert torch.allclose(moving_average(x, longer), so_far, atol=1e-5)
 
 
 def test_steps_since_change():
@@ -283,13 +318,22 @@ def test_summary_interval_is_of_95_percent():
     assert (high - mean) / error == pytest.approx(1.96, abs=0.06)
 
 
+def test_an_interval_is_of_a_thousand_resamples_by_one_seed_unless_told_otherwise():
+    values = torch.randn(20, generator=torch.Generator().manual_seed(4))
+    assert summarize(values) == summarize(values, 0, 1000)
+    for other in ((1, 1000), (0, 999)):
+        assert summarize(values) != summarize(values, *other)
+
+
 def test_events_get_wilsons_interval():
     """Against published values: 0 of 10 is 0 to 0.278, 81 of 263 is 0.255 to 0.366."""
     none = summarize(torch.zeros(10, dtype=torch.bool))
     assert (none["mean"], none["n"]) == (0.0, 10)
     assert none["ci95"] == pytest.approx([0.0, 0.2775], abs=1e-3)
     assert summarize(torch.arange(263) < 81)["ci95"] == pytest.approx([0.2553, 0.3662], abs=1e-3)
-    assert summarize(torch.ones(10, dtype=torch.bool))["ci95"][1] == 1.0
+    for n in range(1, 100):  # not beside them by a rounding
+        assert wilson_interval(0.0, n)[0] == 0.0
+        assert wilson_interval(1.0, n)[1] == 1.0
 
 
 def test_summary_counts_who_was_measured():
@@ -300,7 +344,7 @@ def test_summary_counts_who_was_measured():
 
 def test_what_cannot_be_measured_is_null_with_a_reason():
     s = summarize(torch.tensor([math.nan]))
-    assert s["mean"] is None
+    assert (s["mean"], s["std"], s["ci95"], s["n"]) == (None, None, None, 0)
     assert s["reason"]
     result = {
         "protocol": "p",
@@ -323,3 +367,6 @@ def test_path_error_is_of_envs_that_follow_a_path():
     m = tracking_measures(t, 0.8)
     assert m["e_path"][0] == pytest.approx(0.3)
     assert m["e_path"][1].isnan()
+    t.path_error[150:, 0], t.fell[150, 0] = 9.0, True  # where it lies says nothing of how it walked
+    t.path_error[:100, 0] = math.nan
+    assert tracking_measures(t, 0.8)["e_path"][0] == pytest.approx(0.4)
