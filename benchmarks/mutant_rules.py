@@ -47,7 +47,7 @@ class Mutant:
 
     def change(self, original: str) -> tuple[str, str]:
         """The first line that differs, as it is and as the mutant has it (empty if removed), not indented."""
-        before, after = original.splitlines(), self.source(original).splitlines()
+        before, after = ([x for x in text.splitlines() if x.strip()] for text in (original, self.source(original)))
         at = next((i for i, (a, b) in enumerate(zip(before, after, strict=False)) if a != b), len(after))
         return before[at].strip(), "" if len(after) < len(before) else after[at].strip()
 

@@ -128,6 +128,19 @@ def test_the_golden_pair_is_the_policys(random_checkpoint, random_policy):
     assert np.abs(action).max() > 0.01
 
 
+def test_the_golden_moment_is_one_that_a_robot_can_be_in(policy, spec):
+    """A little off its default pose, moving and tilted, each by as much as is drawn; gravity has length 1."""
+    readings = policy.metadata.golden["readings"]
+    moved = np.array(readings["joint_pos"]) - [j.default_rad for j in spec.joints]
+    rates, turn, tilt = readings["joint_vel"], readings["angular_velocity"], readings["gravity"][:2]
+    for values, most in ((moved, 0.1), (rates, 0.5), (turn, 0.3), (tilt, 0.1)):
+        assert 0.2 * most < np.abs(values).max() <= most
+    for values in (moved, rates):
+        assert np.min(values) < 0.0 < np.max(values)
+    assert np.linalg.norm(readings["gravity"]) == pytest.approx(1.0, abs=1e-9)
+    assert readings["gravity"][2] < 0.0
+
+
 def test_a_distilled_policy_says_in_which_ranges_its_law_was_trained(spec):
     training = DISTILL_RECIPES["default"](BASE_RECIPES["default"]())
     targets = JointTargets(training.env.actions, spec)
@@ -231,15 +244,23 @@ def test_files_that_are_no_policy_are_refused_by_name(change, message, policy_fi
     ("name", "value", "message"),
     [
         ("robot", 3, "metadata robot must be a text, got 3"),
+        ("checkpoint_sha256", 3, "metadata checkpoint_sha256 must be a text, got 3"),
+        ("cotap_version", None, "metadata cotap_version must be a text, got None"),
         ("stage", None, "metadata stage None is unknown; known: base, distill"),
         ("joints", ["a"] * 19, "metadata joints must be a list of different names"),
         ("joints", {"a": 1}, "metadata joints must be a list of different names"),
+        ("joints", [*range(19)], "metadata joints must be a list of different names"),
+        ("joints", [], "metadata joints must be a list of different names"),
         ("kp", 100.0, "metadata kp must be a list"),
         ("golden", {"observation": [1.0], "joint_targets": []}, "golden.observation has 1 entries for 430 numbers"),
         ("golden", {}, "golden.observation must be a list, got None"),
         ("kd", [True] * 19, "kd holds what is not a finite number"),
         ("nominal_height_m", "1", "metadata nominal_height_m must be a finite number"),
         ("control_dt", True, "metadata control_dt must be a finite number"),
+        ("control_dt", 1.001, "metadata control_dt must lie in"),
+        ("control_dt", 9e-5, "metadata control_dt must lie in"),
+        ("nominal_height_m", -0.01, "metadata nominal_height_m must lie in"),
+        ("nominal_height_m", 100.1, "metadata nominal_height_m must lie in"),
         ("opset", 2.5, "metadata opset must be a positive integer"),
         ("commands", 3, "metadata commands must be an object"),
         ("law", 3, "metadata law must be an object"),
@@ -260,6 +281,7 @@ def test_metadata_of_another_kind_is_named(name, value, message, policy_file, tm
         ("observation", {"terms": 3}, "metadata observation.terms must be a list"),
         ("observation", {"terms": [["a", 1.0, 1.0]]}, "width of a must be a positive integer"),
         ("action", {"scale_rad": [0.0] * 19}, "metadata action.scale_rad must lie in"),
+        ("action", {"scale_rad": [0.1] * 18 + [1001.0]}, "metadata action.scale_rad must lie in"),
         ("action", {"scale_rad": [0.1]}, "action.scale_rad has 1 entries for 19 joints"),
         ("action", {"clip": -1.0}, "metadata action.clip must lie in"),
         ("action", {"upper_mode": "sideways"}, "action.upper_mode 'sideways' is unknown"),

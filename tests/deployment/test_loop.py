@@ -479,6 +479,62 @@ def test_the_trained_law_is_the_default(policy):
         robot_of(dataclasses.replace(policy.metadata, robot="h2"))
 
 
+@pytest.mark.parametrize(
+    ("key", "velocity", "yaw_rate", "height", "far"),
+    [("w", (0.1, 0.0), 0.0, 0.0, 1.0), ("s", (-0.1, 0.0), 0.0, 0.0, -1.0), ("q", (0.0, 0.1), 0.0, 0.0, 0.5),
+     ("e", (0.0, -0.1), 0.0, 0.0, -0.5), ("a", (0.0, 0.0), 0.1, 0.0, 0.8), ("d", (0.0, 0.0), -0.1, 0.0, -0.8),
+     ("f", (0.0, 0.0), 0.0, -0.02, -0.2), ("r", (0.0, 0.0), 0.0, 0.0, 0.0)],
+)  # fmt: skip
+def test_each_key_changes_one_thing_up_to_its_limit(key, velocity, yaw_rate, height, far):
+    stick = Stick()
+    command = stick.press(key)
+    stands = velocity == (0.0, 0.0) and yaw_rate == 0.0
+    assert command == TimedCommand(velocity=velocity, yaw_rate=yaw_rate, stand=stands, height_offset=height)
+    for _ in range(30):
+        command = stick.press(key)
+    found = (*command.velocity, command.yaw_rate, command.height_offset)
+    assert [x for x in found if x] == ([far] if far else [])
+    command.check("key")
+
+
+def test_height_is_commanded_in_stance_and_speed_while_walking():
+    stick = Stick()
+    for key in "fff":
+        stick.press(key)
+    assert stick.press("r").height_offset == -0.04
+    assert stick.press("w") == TimedCommand(velocity=(0.1, 0.0))
+    assert stick.press("q") == TimedCommand(velocity=(0.1, 0.1))
+    assert stick.press("f") == TimedCommand(stand=True, height_offset=-0.02)
+    assert stick.press("?") == TimedCommand(stand=True, height_offset=-0.02)
+
+
+@pytest.mark.parametrize(
+    ("fields", "fits"),
+    [({"delay_steps": (0, 0)}, True), ({"delay_steps": (50, 50)}, True), ({"delay_steps": (0, 51)}, False),
+     ({"delay_steps": (-1, 0)}, False), ({"delay_steps": (2, 1)}, False), ({"delay_steps": (0.0, 1)}, False),
+     ({"delay_steps": (0, 1.0)}, False), ({"drop": 0.99}, True), ({"drop": 0.991}, False),
+     ({"encoder_noise": 1.001}, False), ({"velocity_noise": 100.1}, False), ({"mass_error": 0.901}, False),
+     ({"start_error": 0.5}, True), ({"start_error": 0.501}, False), ({"start_error": -0.001}, False)],
+)  # fmt: skip
+def test_perturbations_have_bounds(fields, fits):
+    if fits:
+        Perturbations(**fields).check()
+    else:
+        with pytest.raises(ValueError, match=next(iter(fields))):
+            Perturbations(**fields).check()
+
+
+@pytest.mark.parametrize(
+    ("field", "low", "high"),
+    [("ramp_s", 0.0, 60.0), ("settle_s", 0.0, 60.0), ("max_tilt", 0.1, 3.2), ("saturation_s", 0.02, 1e6)],
+)
+def test_limits_of_safety_have_bounds(field, low, high):
+    for bound, beyond in ((low, low - 1e-3), (high, high * 1.001)):
+        SafetyConfig(**{field: bound}).check()
+        with pytest.raises(ValueError, match=f"{field} must lie in"):
+            SafetyConfig(**{field: beyond}).check()
+
+
 def test_keys_build_up_commands():
     stick = Stick()
     for key in "wwwa":

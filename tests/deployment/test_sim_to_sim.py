@@ -12,12 +12,24 @@ import numpy as np
 import pytest
 import torch
 
+from cotap.compliance.laws import LawConfig
 from cotap.deployment import sim_to_sim
+from cotap.deployment.controller import law_config
 from cotap.deployment.engines import EngineConfig
 from cotap.deployment.robot import Perturbations
 from cotap.deployment.safety import SafetyConfig
 from cotap.deployment.scenario import Scenario
-from cotap.deployment.sim_to_sim import Comparison, falls, loads, mean_pose, periodic, statics
+from cotap.deployment.sim_to_sim import (
+    Comparison,
+    compare,
+    falls,
+    figure,
+    loads,
+    markdown,
+    mean_pose,
+    periodic,
+    statics,
+)
 from cotap.deployment.trial import Trial
 from cotap.deployment.workers import Workers
 from cotap.envs.upper_body import UpperBodyConfig
@@ -51,6 +63,7 @@ def test_trials_that_fell_are_in_no_figure_of_the_hand(spec: RobotSpec, part: Ca
     if part is loads:
         assert one["displacement_z"]["mean"] == two["displacement_z"]["mean"] == pytest.approx(-0.05, abs=1e-3)
         assert one["curve"] == two["curve"]
+        np.testing.assert_allclose(one["curve"], [0.0] * 25 + [0.05] * 200, atol=1e-6)  # from half a second before
         assert none["displacement_z"]["mean"] is None
         assert none["curve"] == []
     else:
@@ -131,6 +144,94 @@ def test_a_small_comparison_is_written_whole(shipped_file, tmp_path, monkeypatch
     assert json.loads((tmp_path / "report.json").read_text())["engines"] == result["engines"]
     with pytest.raises(TypeError):
         script.main([*arguments, "--seed", "1"])
+
+
+def test_parts_are_run_as_they_ask_and_otherwise_as_the_policy_was_trained(policy, policy_file, monkeypatch):
+    asked = []
+
+    class Recorder:
+        def __init__(self, *_):
+            pass
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+        def trials(self, *arguments):
+            asked.append(arguments)
+            return []
+
+    wrong, laws = Perturbations(drop=0.1), UpperBodyConfig(LawConfig("cotap"))
+
+    def parts(policy, cfg, run):
+        del policy, cfg
+        return {"a": lambda: {"ran": run(Scenario(1.0), 3)}, "b": lambda: {"ran": run(Scenario(2.0), 4, laws, wrong)}}
+
+    monkeypatch.setattr(sim_to_sim, "Workers", Recorder)
+    monkeypatch.setattr(sim_to_sim, "_parts", parts)
+    result = compare(policy_file, Comparison(engines=("mujoco",), seed=7, timestep=0.002))
+    engine, safety = EngineConfig("mujoco", 0.002), SafetyConfig()
+    assert asked == [
+        ((law_config(policy.metadata), engine, Perturbations(), safety, Scenario(1.0)), 3, 7),
+        ((laws, engine, wrong, safety, Scenario(2.0)), 4, 7),
+    ]
+    assert result["engines"] == {"mujoco": {"a": {"ran": []}, "b": {"ran": []}}}
+    assert result["dt"] == policy.metadata.control_dt
+
+
+def a_result() -> dict[str, Any]:
+    """Of one engine, made up."""
+    fell = {"trials": 20, "falls": 2, "ci95": [0.028, 0.301]}
+    some, none = {"mean": 0.25, "ci95": [0.2, 0.3125]}, {"mean": None, "ci95": None}
+    law = fell | {"metrics": {"e_torso": some, "e_ee_hit": none, "j_upper": some}, "displacement_z": none}
+    arms = {
+        "left": {"elbow_torque_nm": 6.0, "elbow_torque_statics_nm": 5.0, "hand_swing_m": 0.05,
+                 "hand_swing_statics_m": None, "torque": [1.0, 3.0]},
+        "right": dict.fromkeys(sim_to_sim.SWINGS),
+    }  # fmt: skip
+    one = {
+        "velocity-tracking": fell | {"metrics": {"e_lin": some}}, "impact": {"PD": law | {"curve": [0.1, 0.2, 0.4]}},
+        "constant-load": {"PD": law | {"curve": []}}, "periodic-load": {"time": [0.0, 0.02], "arms": arms},
+        "perturbations": {"late": fell},
+    }  # fmt: skip
+    return {"dt": 0.02, "engines": {"mujoco": one}}
+
+
+def test_the_report_has_every_number_in_its_place():
+    shown = "0.250 (0.200 to 0.312)"
+    rows = [line for line in markdown(a_result()).splitlines() if line and not line.startswith("|---")]
+    head = "| engine | law | fell | e_torso [m/s] | e_ee_hit [m] | j_upper [Nm] | hand z at the end [m] |"
+    assert rows == [
+        "## Velocity tracking", "| measure | mujoco |", "| trials that fell | 2 of 20 (3 to 30 %) |",
+        f"| e_lin | {shown} |",
+        "## Impact of 500 N for 0.05 s, left hand, stance", head,
+        f"| mujoco | PD | 2 of 20 (3 to 30 %) | {shown} | - | {shown} | - |",
+        "## Constant load of -50 N, left hand, stance", head,
+        f"| mujoco | PD | 2 of 20 (3 to 30 %) | {shown} | - | {shown} | - |",
+        "## Periodic load of 30 N, 4 s, both hands: left alpha 0.7 at 500 N/m, right PD",
+        "| engine | arm | elbow torque [Nm] | of it statics | hand swing [m] | of it statics |",
+        "| mujoco | left | 6.000 | 5.000 | 0.050 | - |", "| mujoco | right | - | - | - | - |",
+        "## Perturbations", "| what is wrong, fell | mujoco |", "| late | 2 of 20 (3 to 30 %) |",
+    ]  # fmt: skip
+
+
+def test_the_figure_draws_errors_from_the_onset_on_and_torques_about_statics(tmp_path, monkeypatch):
+    import matplotlib.pyplot as plt
+
+    result, kept, close = a_result(), [], plt.close
+    right = result["engines"]["mujoco"]["periodic-load"]["arms"]["right"]
+    right |= {"torque": [0.0, 2.0], "elbow_torque_statics_nm": 7.0}
+    monkeypatch.setattr(plt, "close", kept.append)
+    figure(result, tmp_path / "x.png")
+    impact, load, periodic_load = kept[0].axes
+    assert [axis.get_title() for axis in (impact, load)] == ["mujoco, impact", "mujoco, constant-load"]
+    np.testing.assert_allclose(impact.lines[0].get_xydata(), [[-0.5, 0.1], [-0.48, 0.2], [-0.46, 0.4]])
+    drawn = [line.get_ydata() for line in periodic_load.lines]
+    np.testing.assert_allclose(drawn, [[0.0, 2.0], [-6.0] * 2, [8.0] * 2, [1.0, 3.0], [-3.0] * 2, [7.0] * 2])
+    assert (tmp_path / "x.png").read_bytes().startswith(b"\x89PNG")
+    close(kept[0])
 
 
 def test_trials_do_not_depend_on_the_number_of_processes(policy_file):
