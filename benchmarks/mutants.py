@@ -51,16 +51,14 @@ def main() -> int:
     with copied_tree(ROOT) as tree:
         runner = Runner(tree)
         for room in args.rooms:
-            earlier = results.get(room, []) if args.again else []
-            survivors = [t for t in earlier if t.verdict == SURVIVED]
-            mutants = _unchanged(tree, survivors) if args.again else _chosen(tree, room, args)
-            results[room] = [t for t in earlier if t.verdict != SURVIVED]
+            rows = {t.mutant: t for t in results.get(room, [])} if args.again else {}
+            mutants = _survivors(tree, list(rows.values())) if args.again else _chosen(tree, room, args)
             for number, mutant in enumerate(mutants, 1):
-                tried = _try(runner, tree, room, mutant, reasons)
-                results[room].append(tried)
-                _progress(room, number, len(mutants), tried)
-            _write(args.results, results)
-    return report({room: results[room] for room in args.rooms})
+                rows[mutant] = _try(runner, tree, room, mutant, reasons)
+                results[room] = list(rows.values())
+                _write(args.results, results)  # each time, so that an interrupted run is not lost
+                _progress(room, number, len(mutants), rows[mutant])
+    return report({room: results.get(room, []) for room in args.rooms})
 
 
 def _arguments() -> argparse.Namespace:
@@ -93,8 +91,9 @@ def _chosen(tree: Path, room: str, args: argparse.Namespace) -> list[Mutant]:
     return [chance.choice(by_place[place]) for place in sorted(drawn)]
 
 
-def _unchanged(tree: Path, survivors: list[Tried]) -> list[Mutant]:
-    """Their mutants. Raises ValueError if one is no longer the same change."""
+def _survivors(tree: Path, tried: list[Tried]) -> list[Mutant]:
+    """Mutants that survived. Raises ValueError if one is no longer the same change."""
+    survivors = [t for t in tried if t.verdict == SURVIVED]
     for t in survivors:
         if _change(tree, t.mutant) != (t.before, t.after):
             raise ValueError(f"{t.mutant.file} has changed since the results were written; run without --again")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -171,7 +172,7 @@ def test_bad_fields_are_named(field, value):
      ("store_energy", 0.0, 1e6), ("store_power", 0.0, 1e6)],
 )  # fmt: skip
 def test_numbers_may_lie_at_their_bounds_and_not_beyond(field, low, high):
-    for bound, beyond in ((low, low - 1e-3), (high, high * 1.001)):
+    for bound, beyond in ((low, math.nextafter(low, -1.0)), (high, math.nextafter(high, math.inf))):
         LawConfig(**{field: bound}).check()
         with pytest.raises(ValueError, match=rf"law\.{field} must lie in"):
             LawConfig(**{field: beyond}).check()
@@ -179,7 +180,7 @@ def test_numbers_may_lie_at_their_bounds_and_not_beyond(field, low, high):
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_each_axis_has_bounds_on_its_stiffness(axis):
-    for bound, beyond in ((1.0, 0.999), (1e5, 1.001e5)):
+    for bound, beyond in ((1.0, math.nextafter(1.0, 0.0)), (1e5, math.nextafter(1e5, math.inf))):
         each = [300.0, 300.0, 300.0]
         each[axis] = bound
         LawConfig(stiffness=tuple(each)).check()
