@@ -174,7 +174,7 @@ CASES = [
     ("lower_acceleration", {"joint_acceleration": [[1.0, -2.0, 3.0, 50.0, 50.0]]}, 14.0),
     ("upper_acceleration", {"joint_acceleration": [[50.0, 50.0, 50.0, 2.0, -3.0]]}, 13.0),
     ("lower_action_rate", {"action": [[1, 2, 3, 9, 9.0]], "last_action": [[2, 2, 1, 0, 0.0]]}, 5.0),
-    ("upper_action_rate", {"action": [[9, 9, 9, 1, -1.0]], "last_action": [[0, 0, 0, 2, 1.0]]}, 5.0),
+    ("upper_action_rate", {"action": [[9, 9, 9, 1, -1.0]], "last_action": [[0, 0, 0, 2, 2.0]]}, 10.0),
     ("lower_joint_limits", {"joint_pos": [[-0.7, 0.6, 0.5, 9.0, -9.0]]}, 0.3),
     ("upper_joint_limits", {"joint_pos": [[9.0, -9.0, 9.0, 0.7, -0.6]]}, 0.3),
     ("reference_closeness", {"arm_target": [[0.3, 0.0]], "position": [[0.0, 0.4]]}, math.exp(-2.0 * 0.5)),
