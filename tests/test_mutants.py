@@ -1,11 +1,16 @@
-"""Which places of a module `make mutants` leaves out, and that it leaves out no other."""
+"""What `make mutants` leaves out, and that it leaves out no other; files and lines that it names."""
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import pytest
 
+from benchmarks.mutant_rooms import ROOMS
 from benchmarks.mutant_spans import spans_without_effect
 
+ROOT = Path(__file__).parents[1]
 MODULE = """
 from __future__ import annotations
 
@@ -45,3 +50,24 @@ def test_what_changes_something_counts(place):
 
 def test_annotations_count_where_python_evaluates_them():
     assert spans_without_effect("x: int = 1") == []
+
+
+@pytest.mark.parametrize("room", ["compliance", "deployment"])
+def test_a_room_has_all_its_files(room):
+    files = [path for path in (ROOT / "src/cotap" / room).glob("*.py") if len(path.read_text().splitlines()) > 1]
+    assert set(ROOMS[room]) == {path.relative_to(ROOT).as_posix() for path in files}
+
+
+def test_tests_of_a_room_exist():
+    for test in {test for room in ROOMS.values() for tests in room.values() for test in tests}:
+        file, _, function = test.partition("::")
+        assert f"def {function}" in (ROOT / file).read_text(encoding="utf-8")
+
+
+def test_lines_that_may_change_are_there():
+    """Each with a reason; a line that has changed must be judged anew."""
+    for entry in json.loads((ROOT / "benchmarks/equivalent_mutants.json").read_text(encoding="utf-8")):
+        lines = [line.strip() for line in (ROOT / entry["file"]).read_text(encoding="utf-8").splitlines()]
+        assert entry["code"] in lines
+        assert entry["code"] not in entry["mutants"]
+        assert entry["reason"]
