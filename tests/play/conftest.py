@@ -51,6 +51,14 @@ def server(free_port: int) -> Iterator[ViserServer]:
 
 
 @pytest.fixture
+def two_shipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Policies of two robots, as if they were shipped; those that are shipped are not there."""
+    names = {f"{robot}-base": save_random_policy(tmp_path / f"{robot}.pt", robot=robot) for robot in ("h1", "made-up")}
+    monkeypatch.setattr("cotap.evaluation.policy.shipped_names", lambda: list(names))
+    monkeypatch.setattr("cotap.evaluation.policy.shipped_checkpoint", names.get)
+
+
+@pytest.fixture
 def record(session: Session) -> Callable[..., Recording]:
     """Records some steps of the first robots, both of them with the left hand pushed, robot b under PD."""
 

@@ -14,7 +14,7 @@ from viser import ViserServer
 
 from cotap.evaluation.recording import load_recording
 from cotap.play import ROBOTS
-from cotap.play.__main__ import PlayOptions, _live, main
+from cotap.play.__main__ import PlayOptions, _live, main, restart
 from cotap.play.app import START, STOP, App
 from cotap.play.controls import Refused
 from cotap.play.forces import Push
@@ -102,6 +102,55 @@ def test_a_velocity_ends_standing_and_standing_ends_velocities(app):
     ask("stand", True)
     app.advance()
     assert shown(app, *names) == [True, 0.0, 0.0, 0.0]
+
+
+def choose(app, robot):
+    """As a viewer does, who has the list open."""
+    handle = next(h for h in app.server.gui._gui_input_handle_from_uuid.values() if getattr(h, "label", "") == "robot")
+    handle._impl.value = robot
+    event = SimpleNamespace(client_id=1, client=None, target=handle)
+    asyncio.run(handle._impl.update_cb[0](event))
+    return handle
+
+
+@pytest.mark.usefixtures("two_shipped")
+def test_another_robot_is_chosen_and_the_first_one_again(server, checkpoint, tmp_path):
+    options = PlayOptions(checkpoint=(str(checkpoint),), output=str(tmp_path / "out"))
+    app = _live(options)(server)
+    assert choose(app, "h1").options == ("h1", "made-up")
+    app.mailbox.ask(Record(True))
+    app.mailbox.set("a.left.stiffness_x", 700.0)
+    app.advance()
+    choose(app, "made-up")
+    assert app.run() == "made-up"
+    assert len(load_recording(app.archive.path).trajectory.fell) >= 1  # what was recorded is kept
+    other = restart(server, options, "made-up")
+    assert other.session.env.spec.name == "made-up"
+    assert other.session.controls["a.checkpoint"].options == ("shipped made-up-base",)
+    assert other.session.values["a.left.stiffness_x"] == 300.0
+    other.advance()
+    other.scene.show(other._latest[1])
+    assert choose(other, "h1").options == ("h1", "made-up")
+    first = restart(server, options, other.run())
+    assert first.session.controls["a.checkpoint"].options == (str(checkpoint), "shipped h1-base")
+    first.advance()
+    first.scene.show(first._latest[1])
+
+
+@pytest.mark.usefixtures("two_shipped")
+def test_a_robot_that_is_not_offered_or_comes_while_a_film_is_made_is_refused(server, tmp_path):
+    told = []
+    app = _live(PlayOptions(output=str(tmp_path)))(server)
+    app.notices.tell = lambda text, *_: told.append(text)
+    assert choose(app, "atlas").value == "h1"
+    app.archive.filming.set()
+    assert choose(app, "made-up").value == "h1"
+    app.archive.filming.clear()
+    assert told == [
+        "robot 'atlas' is unknown; known: h1, made-up",
+        "a film is being made; choose a robot when it is done",
+    ]
+    assert not app._stop.is_set()
 
 
 def test_what_does_nothing_at_present_is_grey(app):

@@ -21,6 +21,7 @@ from viser import transforms as tf
 from viser._messages import GuiUpdateMessage
 
 from cotap.play import ROBOTS
+from cotap.play.__main__ import PlayOptions, _live, restart
 from cotap.play.app import App
 from cotap.play.rules import VELOCITIES
 from cotap.play.scene import Scene
@@ -132,27 +133,34 @@ class Tunnel:
 
 @pytest.fixture
 def page(free_port: int, tmp_path: Path, checkpoint: Path) -> Iterator[Page]:
-    from playwright.sync_api import sync_playwright
-
     server = open_server("127.0.0.1", free_port)
     session = Session({"base": checkpoint})
     app = App(server, Scene(server, session.env.spec, len(ROBOTS)), session, tmp_path)
     thread = threading.Thread(target=app.run, daemon=True)
     thread.start()
+    with opened(app) as page:
+        yield page
+    app.stop()
+    thread.join(10.0)
+    server.stop()
+    assert not thread.is_alive()
+
+
+@contextlib.contextmanager
+def opened(app: App) -> Iterator[Page]:
+    """The page of an app that runs, in a browser."""
+    from playwright.sync_api import sync_playwright
+
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=BROWSER, args=ARGUMENTS)
         page = browser.new_context(viewport={"width": 1280, "height": 1000}).new_page()
         complaints: list[str] = []
         page.on("console", lambda m: complaints.append(m.text) if m.type == "error" else None)
         page.on("pageerror", lambda e: complaints.append(str(e)))
-        page.goto(f"http://127.0.0.1:{free_port}")
+        page.goto(f"http://127.0.0.1:{app.server.get_port()}")
         page.get_by_text("control steps/s").wait_for(timeout=1000.0 * PATIENCE_S)
         yield Page(app, page, complaints)
         browser.close()
-    app.stop()
-    thread.join(10.0)
-    server.stop()
-    assert not thread.is_alive()
 
 
 def test_a_walk_through_the_page(page: Page, tmp_path: Path):
@@ -319,6 +327,40 @@ def test_a_link_reproduces_settings_and_what_is_out_of_range_is_refused(page: Pa
     page.page.get_by_text("K_ee x [N/m] 9999 is outside [50, 1500]; nothing was changed").first.wait_for()
     assert values == before
     assert page.complaints == []
+
+
+@pytest.mark.usefixtures("two_shipped")
+def test_another_robot_comes_onto_the_same_page(free_port: int, tmp_path: Path):
+    server, options = open_server("127.0.0.1", free_port), PlayOptions(output=str(tmp_path))
+    apps = [_live(options)(server)]
+
+    def run() -> None:
+        while robot := apps[-1].run():
+            apps.append(restart(server, options, robot))
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    with opened(apps[0]) as page:
+        for number, robot in ((1, "made-up"), (2, "h1")):
+            page.tab("Robot")
+            page.page.get_by_role("combobox", name="robot").click()
+            page.page.get_by_role("option", name=robot, exact=True).click()
+            page.until("another app", lambda number=number: len(apps) > number)
+            app = apps[number]
+            assert app.session.env.spec.name == robot
+            page.until("it runs", lambda app=app: app.session.num_steps > 20)
+            page.page.get_by_text("control steps/s").wait_for()
+            page.page.keyboard.down("w")
+            page.until("keys drive it", lambda app=app: app.session.values["velocity_x"] > 0.0)
+            page.page.keyboard.up("w")
+        page.page.screenshot(path=tmp_path / "robot.png")
+        assert page.page.get_by_role("tab", name="Robot").count() == 1
+        # A slow browser may still have updates to come of the plots that went.
+        assert [text for text in page.complaints if "non-existent component" not in text] == []
+    apps[-1].stop()
+    thread.join(10.0)
+    server.stop()
+    assert not thread.is_alive()
 
 
 def test_a_website_cannot_use_the_page_and_a_tunnel_can(page: Page, tmp_path: Path):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -88,17 +88,38 @@ def _run(options: PlayOptions) -> int:
             print(f"open {page_url(options.host, options.port, token)}", flush=True)
         loading.remove()
         print(f"ready after {time.perf_counter() - begin:.1f} s; Ctrl-C ends it", flush=True)
-        app.run()
+        while robot := app.run():
+            app = restart(server, options, robot)
     finally:
         server.stop()
     return 0
 
 
-def _live(options: PlayOptions) -> Callable[[ViserServer], App]:
-    """Read what was given: no page is opened for what cannot be shown. Returns what fills the page."""
+def restart(server: ViserServer, options: PlayOptions, robot: str) -> App:
+    """Begin anew on a page with another robot. What was given for the first robot is not this one's."""
+    from cotap.play.server import empty
+
+    first = _first_robot(options)
+    empty(server)
+    loading = server.gui.add_markdown(f"Loading the simulation of {robot} ...")
+    given = options if robot == first else replace(options, checkpoint=(), robot=robot, library="")
+    app = _live(given, first)(server)
+    loading.remove()
+    return app
+
+
+def _first_robot(options: PlayOptions) -> str:
+    return _robot_of(options.checkpoint) if options.checkpoint else options.robot or "h1"
+
+
+def _live(options: PlayOptions, first: str = "") -> Callable[[ViserServer], App]:
+    """Read what was given: no page is opened for what cannot be shown. Returns what fills the page.
+
+    `first` can be chosen again where it is not the robot of the options.
+    """
     from cotap.robots import ROBOTS as KNOWN_ROBOTS
 
-    robot = _robot_of(options.checkpoint) if options.checkpoint else options.robot or "h1"
+    robot = _first_robot(options)
     require_one_of("robot", robot, KNOWN_ROBOTS)
     spec = KNOWN_ROBOTS[robot]()
     if options.robot:
@@ -122,7 +143,9 @@ def _live(options: PlayOptions) -> Callable[[ViserServer], App]:
 
         torch.set_num_threads(1)  # two robots: more would only wait for each other
         session = Session(_policies(options, robot), options.seed, options.library)
-        return App(server, scene, session, Path(options.output))
+        shipped = (name for name in KNOWN_ROBOTS if _shipped_policies(name))
+        robots = tuple(dict.fromkeys((first or robot, robot, *shipped)))
+        return App(server, scene, session, Path(options.output), robots)
 
     return fill
 

@@ -11,7 +11,7 @@ import viser
 
 from cotap.play import ROBOTS
 from cotap.play.archive import Archive
-from cotap.play.controls import Refused
+from cotap.play.controls import Choice, Refused
 from cotap.play.drive import Drive
 from cotap.play.forces import Push
 from cotap.play.guard import PARAMETER
@@ -43,9 +43,12 @@ class App:
         scene: Where it is drawn, of all robots.
         session: What is simulated.
         folder: Where recordings go.
+        robots: Names of robots to choose from; the session's is among them, or there are none.
     """
 
-    def __init__(self, server: viser.ViserServer, scene: Scene, session: Session, folder: Path) -> None:
+    def __init__(
+        self, server: viser.ViserServer, scene: Scene, session: Session, folder: Path, robots: tuple[str, ...] = ()
+    ) -> None:
         self.session, self.server, self.scene = session, server, scene
         self.mailbox = Mailbox(session.controls)
         self.notices = Notices(server)
@@ -54,6 +57,9 @@ class App:
         self.drive = Drive(session.controls)
         self.readout = Readout(session.sides)
         self._stop = threading.Event()
+        self._chosen = ""
+        robot = session.env.spec.name
+        self._robot = Choice("robot", robots or (robot,), robot)
         self._failure: BaseException | None = None
         self._recorder: Recorder | None = None
         self._changes: dict[str, Any] = {}
@@ -61,12 +67,17 @@ class App:
         self._latest: tuple[int, Sample] | None = None
         with server.atomic():
             self.panel = Panel(server, self.mailbox, session.sides, self.notices)
+            with self.panel.robot_tab:
+                self._add_chooser()
             add_script(server, {"drive": self._drive, "link": self._open_link})
             self._add_tabs()
         self.scene.hands.on_drag("left")(self._drag)
 
-    def run(self) -> None:
-        """Simulate and draw until `stop`, or Ctrl-C. Raises what the simulation raises."""
+    def run(self) -> str:
+        """Simulate and draw until `stop`, Ctrl-C or the choice of another robot. Returns the robot chosen, or "".
+
+        Raises what the simulation raises.
+        """
         thread = threading.Thread(target=self._simulate, name="simulation", daemon=True)
         thread.start()
         try:
@@ -76,6 +87,9 @@ class App:
             thread.join(5.0)
         if self._failure is not None:
             raise self._failure
+        if self._chosen:
+            self._keep_recording()
+        return self._chosen
 
     def stop(self) -> None:
         """Let `run` return."""
@@ -214,6 +228,30 @@ class App:
             self._felt = gui.add_markdown("")
             self._live_plots = gui.add_checkbox("live", True)
         self.plots = Plots(self.server, tab, self.session.sides, self.session.dt)
+
+    def _add_chooser(self) -> None:
+        robot = self._robot
+        chooser = self.server.gui.add_dropdown(
+            robot.label, robot.options, initial_value=robot.default, disabled=len(robot.options) < 2,
+            order=-1.0, hint="those of which a policy is shipped; the page begins anew",
+        )  # fmt: skip
+
+        async def choose(event: viser.GuiEvent[Any]) -> None:
+            if event.client_id is None:
+                return
+            try:
+                name, _ = robot.clean(event.target.value)
+                if self.archive.filming.is_set():
+                    raise Refused("a film is being made; choose a robot when it is done")
+            except Refused as refusal:
+                self.notices.tell(str(refusal), event.client, "refused")
+                chooser.value = robot.default
+                return
+            if name != robot.default:
+                self._chosen = name
+                self.stop()
+
+        chooser.on_update(choose)
 
     def _add_view(self) -> None:
         gui, scene = self.server.gui, self.scene

@@ -47,7 +47,8 @@ class Panel:
                 self._add_arms(robot)
         with self.tabs.add_tab("Push"):
             self._add_push()
-        with self.tabs.add_tab("Domain"):
+        self.robot_tab = self.tabs.add_tab("Robot")
+        with self.robot_tab:
             self._add_domain()
         self._show_second(False)
 
