@@ -97,6 +97,7 @@ def _run(options: PlayOptions) -> int:
 
 def restart(server: ViserServer, options: PlayOptions, robot: str) -> App:
     """Begin anew on a page with another robot. What was given for the first robot is not this one's."""
+    from cotap.play.script import reload
     from cotap.play.server import empty
 
     first = _first_robot(options)
@@ -105,6 +106,7 @@ def restart(server: ViserServer, options: PlayOptions, robot: str) -> App:
     given = options if robot == first else replace(options, checkpoint=(), robot=robot, library="")
     app = _live(given, first)(server)
     loading.remove()
+    reload(server)
     return app
 
 

@@ -35,3 +35,10 @@ def add_script(server: viser.ViserServer, hear: Mapping[str, Hear]) -> None:
         boxes[name] = box._impl.uuid
     source = Path(__file__).with_name("browser.js").read_text(encoding="utf-8")
     server._websock_server.queue_message(RunJavascriptMessage(f"const BOXES = {json.dumps(boxes)};\n{source}"))
+
+
+def reload(server: viser.ViserServer) -> None:
+    """Have all browsers that show the page open it anew, without what its URL said: they lay out afresh what has
+    changed as a whole."""
+    for client in server.get_clients().values():
+        client._websock_connection.queue_message(RunJavascriptMessage("location.replace(location.pathname)"))

@@ -29,7 +29,7 @@ def open_server(host: str, port: int, token: str = "") -> viser.ViserServer:
     if server.get_port() != port:  # taken in between: viser goes on to the next
         server.stop()
         raise PortTaken(_advice(host, port, "another program has just taken it"))
-    empty(server)
+    _prepare(server)
     return server
 
 
@@ -37,6 +37,10 @@ def empty(server: viser.ViserServer) -> None:
     """Take all from a page that was on it, and leave it as a new one."""
     server.gui.reset()
     server.scene.reset()
+    _prepare(server)
+
+
+def _prepare(server: viser.ViserServer) -> None:
     server.gui.configure_theme(show_share_button=False, show_logo=False, control_width="large")
     server.gui.main_panel.dock_right()  # beside the scene, not upon it
     # A browser that draws without a graphics card takes seconds to prepare an environment map, and as long for every
