@@ -329,6 +329,21 @@ def test_a_link_reproduces_settings_and_what_is_out_of_range_is_refused(page: Pa
     assert page.complaints == []
 
 
+def test_the_tour_sets_pushes_and_says_what_to_see(page: Page):
+    values = page.app.session.values
+    page.tab("Tour")
+    page.button("Next")
+    page.until("a soft and a stiff hand", lambda: values["a.right.stiffness_x"] == 5.0 * values["a.left.stiffness_x"])
+    page.page.get_by_text("1 of 5: Soft and stiff.").wait_for()
+    page.until("both are pushed", lambda: bool((page.app._latest[1]["hand_force_w"][0, :, 0] > 20.0).all()))
+    for _ in range(2):
+        page.button("Next")
+    page.page.get_by_text("3 of 5: Asked for, or left to the pose.").wait_for()
+    page.until("B is under PD", lambda: values["side_by_side"] and values["b.left.law"] == "pd")
+    page.page.get_by_role("row").filter(has_text="B left").wait_for()
+    assert page.complaints == []
+
+
 @pytest.mark.usefixtures("two_shipped")
 def test_another_robot_comes_onto_the_same_page(free_port: int, tmp_path: Path):
     server, options = open_server("127.0.0.1", free_port), PlayOptions(output=str(tmp_path))

@@ -68,3 +68,14 @@ def test_what_the_last_force_did_stays_in_brackets():
     readout.take(sample((30.0, 0.0, 0.0)))
     readout.take(sample((0.0, 0.0, 0.0)))
     assert rows(readout)["A left"] == ["(30.0)", "(10.0)", "(300)", "(300)"]
+
+
+def test_hands_that_were_put_elsewhere_start_from_there():
+    readout = Readout(SIDES)
+    readout.take(sample((0.0, 0.0, 0.0)))
+    readout.take(sample((30.0, 0.0, 0.0)))
+    readout.clear()
+    assert rows(readout) == {}
+    readout.take(sample((3.0, 0.0, 0.0)))
+    readout.take(sample((33.0, 0.0, 0.0)))
+    assert rows(readout)["A left"][:2] == ["33.0", "10.0"]

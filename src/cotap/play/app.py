@@ -28,6 +28,7 @@ from cotap.play.sample import Sample
 from cotap.play.scene import Scene
 from cotap.play.script import add_script
 from cotap.play.session import Session
+from cotap.play.tour import add_tour
 
 DRAW_HZ, PLOT_HZ, STATUS_HZ = 25.0, 4.0, 4.0
 START, STOP = "Start recording", "Stop and save"
@@ -120,6 +121,7 @@ class App:
                 self.session.push(request)
             elif isinstance(request, Reset):
                 self.session.reset()
+                self.readout.clear()
             elif isinstance(request, Step):
                 if self.session.values["paused"] and not self.archive.filming.is_set():
                     self._step()
@@ -205,7 +207,7 @@ class App:
             parts.append(f"**recording {self._recorder.seconds:.1f} s**")
         self.panel.status.content = " · ".join(parts)
         query = f"?{PARAMETER}={to_text(s.env.spec.name, s.controls, s.values)}"
-        link = f"[Copy a link to these settings]({query}), into the address bar, too."
+        link = f"[Copy a link to these settings]({query}). The address bar shows it, too."
         if self._link.content != link:
             self._link.content = link
 
@@ -224,6 +226,8 @@ class App:
             self.panel.button(STOP, Record(False))
             self.archive.add_buttons(gui, self.scene)
             self._link = gui.add_markdown("")
+        with self.panel.tabs.add_tab("Tour"):
+            add_tour(gui, self.session.controls, self.session.sides, self.panel.do)
         with plots_tab(self.server) as tab:
             self._felt = gui.add_markdown("")
             self._live_plots = gui.add_checkbox("live", True)

@@ -37,7 +37,12 @@ def from_text(text: object, robot: str, controls: Mapping[str, Control]) -> dict
     if given.pop("robot", None) != robot:
         raise Refused(f"the link is of another robot than {robot}")
     values = {name: _read(linked[name], written) for name, written in given.items()}
-    return {name: control.default for name, control in linked.items()} | consistent(values)
+    return defaults(controls) | consistent(values)
+
+
+def defaults(controls: Mapping[str, Control]) -> dict[str, Any]:
+    """Of every setting that a link has."""
+    return {name: control.default for name, control in _linked(controls).items()}
 
 
 def _linked(controls: Mapping[str, Control]) -> dict[str, Number | Choice | Flag]:

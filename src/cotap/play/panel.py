@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import viser
@@ -111,6 +111,12 @@ class Panel:
         self._good[name] = clean
         if name == "side_by_side":
             self._show_second(clean)
+
+    def do(self, values: Mapping[str, Any], requests: Sequence[Request], client: viser.ClientHandle | None) -> None:
+        """Set controls, then ask for something. Raises Refused for what cannot be set."""
+        self.apply(values)
+        for request in requests:
+            self._ask(request, client)
 
     def _ask(self, request: Request, client: viser.ClientHandle | None) -> None:
         try:

@@ -25,6 +25,10 @@ class Readout:
         self._sides = sides
         self._last: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
+    def clear(self) -> None:
+        """Forget what was: hands have been put elsewhere."""
+        self._last = None
+
     def take(self, sample: Sample) -> None:
         """Take note of one step."""
         force = np.einsum("nji,nhj->nhi", sample["heading_w"], sample["hand_force_w"])
@@ -43,10 +47,11 @@ class Readout:
 
     def table(self, count: int) -> str:
         """Markdown of a row for each hand of the first `count` robots; in brackets what the last force did."""
-        lines = ["| hand | force [N] | moved [cm] | felt [N/m] | asked [N/m] |", "|---|---|---|---|---|"]
-        if self._last is None:
+        lines = ["| hand | load [N] | moved [cm] | felt [N/m] | asked [N/m] |", "|---|---|---|---|---|"]
+        last = self._last
+        if last is None:
             return "\n".join(lines)
-        _, felt, loaded = self._last
+        _, felt, loaded = last
         for robot in range(min(count, len(felt))):
             for hand, side in enumerate(self._sides):
                 name = f"{ROBOTS[robot].upper()} {side}" if count > 1 else side

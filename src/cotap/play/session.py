@@ -86,6 +86,8 @@ class Session:
         notices = []
         for name, value in values.items():
             before, self.values[name] = self.values[name], value
+            if value == before:
+                continue
             try:
                 self._apply(name)
             except (ValueError, OSError) as error:
