@@ -136,6 +136,15 @@ def test_the_matched_composition_splits_the_compliance(arms):
         torch.testing.assert_close(torque.stiffness, alone.stiffness)
 
 
+def test_model_and_tracking_law_have_the_stiffness_commanded_unless_scaled(arms):
+    cotap, state = LAWS["cotap"](arms, LawConfig("cotap")), a_state(arms, hand_force_h=torch.full((3, 2, 3), 6.0))
+    for scales, reference, arm in (((), 600.0, 600.0), ((2.0, 0.5), 1200.0, 300.0)):
+        torque, report = AdmittanceLaw(arms, StaticShift(), cotap, *scales)(state, parameters(stiffness=600.0))
+        torch.testing.assert_close(torque.stiffness, cotap(state, parameters(stiffness=arm))[0].stiffness)
+        shift = torch.full((3, 2), 6.0 * 3.0**0.5 / reference)
+        torch.testing.assert_close(report.values["reference_shift"], shift, atol=1e-5, rtol=0)
+
+
 def test_envs_that_begin_anew_forget(arms):
     force = torch.tensor([0.0, 0.0, 50.0]).expand(3, 2, 3)
     law, old = LAWS["facet"](arms, LawConfig("facet")), torch.zeros(3, dtype=torch.bool)

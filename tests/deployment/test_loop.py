@@ -115,6 +115,21 @@ def test_laws_are_late_by_the_delay_but_a_stop_is_not(spec, default):
     assert robot.torque()[0] == 0.0
 
 
+def test_delays_are_drawn_from_all_of_their_range(spec, default):
+    robot, found = make_robot(spec, Perturbations(delay_steps=(1, 3))), set()
+    still = pd_law(np.zeros(19), np.zeros(19), np.zeros(19))
+    marked = JointLaw(still.bias + 1.0, still.stiffness, still.damping)
+    for seed in range(20):
+        robot.start(default, seed)
+        late = 0
+        robot.act(marked, FREE)
+        while robot.torque()[0] != 1.0:
+            robot.act(marked, FREE)
+            late += 1
+        found.add(late)
+    assert found == {1, 2, 3}
+
+
 def test_readings_are_lost_and_noisy_as_configured(spec, default):
     robot = make_robot(spec, Perturbations(drop=0.3, encoder_noise=0.01, velocity_noise=0.5))
     robot.start(default, 0)
