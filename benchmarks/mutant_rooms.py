@@ -33,6 +33,7 @@ ROOMS: dict[str, dict[str, tuple[str, ...]]] = {
         "src/cotap/compliance/laws.py": (LAWS, ADMITTANCE, PASSIVE, HELP),
         "src/cotap/compliance/passive_law.py": (PASSIVE,),
         "src/cotap/compliance/passivity.py": (PASSIVITY,),
+        "src/cotap/compliance/pose_task.py": ("tests/compliance/test_pose_task.py",),
         "src/cotap/compliance/spd.py": (SPD, STIFFNESS),
         "src/cotap/compliance/stiffness.py": (STIFFNESS, LAWS),
         "src/cotap/compliance/torso.py": (TORSO,),

@@ -21,7 +21,7 @@ SLOW_TO_IMPORT = (
     "torch", "torch._dynamo", "torch.export", "numpy", "scipy.spatial.transform", "mujoco", "tensordict", "gymnasium",
     "matplotlib.figure", "hypothesis", "pytest",
 )  # fmt: skip
-COPIED = ("src", "tests", "scripts", "benchmarks", "pyproject.toml", "README.md", "docs", "examples")
+NOT_COPIED = (".*", "__pycache__", "*.egg-info", "runs", "site", "dist", "build")
 PATIENCE, GRACE_S = 4.0, 20.0
 """A mutant is killed, too, if its tests take so many times as long as without it, and so much more."""
 
@@ -112,10 +112,6 @@ class ShortestFirst:
 def copied_tree(root: Path) -> Iterator[Path]:
     """A copy of the repository that is removed afterwards: a run that is killed leaves no mutant in the original."""
     with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
-        tree = Path(folder)
-        for name in COPIED:
-            if (root / name).is_dir():
-                shutil.copytree(root / name, tree / name, ignore=shutil.ignore_patterns("__pycache__"))
-            elif (root / name).exists():
-                shutil.copy2(root / name, tree / name)
+        tree = Path(folder) / root.name
+        shutil.copytree(root, tree, ignore=shutil.ignore_patterns(*NOT_COPIED))
         yield tree

@@ -115,6 +115,13 @@ def test_metadata_says_what_each_term_of_the_observation_is(robot, random_checkp
     for (name, width, _), entry in zip(m.observation["terms"], about.values(), strict=True):
         for bound in entry["range"] or ():
             assert not isinstance(bound, list) or len(bound) == width, name
+    for name in ("projected_gravity", "sin_phase", "cos_phase"):
+        assert about[name]["range"] == [-1.0, 1.0]
+    assert (about["command_stand"]["range"], about["last_action"]["range"]) == ([0.0, 1.0], [-20.0, 20.0])
+    speeds = [j.velocity_limit_rad_s for j in spec.joints]
+    assert about["joint_velocity"]["range"] == [[-v for v in speeds], speeds]
+    limits = [j.torque_limit_nm for j in spec.joints[len(spec.lower_joints) :]]
+    assert about["arm_torque"]["range"] == [[-t for t in limits], limits]
     q = np.array(m.golden["readings"]["joint_pos"])
     low, high = (np.array(bound) for bound in about["joint_position"]["range"])
     assert ((low <= q - m.default_pose_rad) & (q - m.default_pose_rad <= high)).mean() > 0.9

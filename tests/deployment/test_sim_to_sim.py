@@ -75,6 +75,19 @@ def test_trials_that_fell_are_in_no_figure_of_the_hand(spec: RobotSpec, part: Ca
     assert two["falls"] == none["falls"] == 1
 
 
+def test_perturbations_are_what_their_labels_say():
+    assert {label: tuple(vars(p).values()) for label, p in sim_to_sim.PERTURBATIONS.items()} == {
+        "none": ((0, 0), 0.0, 0.0, 0.0, 0.0, 0.0),
+        "delay of 1 step": ((1, 1), 0.0, 0.0, 0.0, 0.0, 0.0),
+        "delay of 2 steps": ((2, 2), 0.0, 0.0, 0.0, 0.0, 0.0),
+        "5 % of readings lost": ((0, 0), 0.05, 0.0, 0.0, 0.0, 0.0),
+        "encoder noise of 0.01 rad, 0.5 rad/s": ((0, 0), 0.0, 0.01, 0.5, 0.0, 0.0),
+        "masses wrong by 20 %": ((0, 0), 0.0, 0.0, 0.0, 0.2, 0.0),
+        "start off by 0.05 rad": ((0, 0), 0.0, 0.0, 0.0, 0.0, 0.05),
+        "all at once, delay of 1 to 2 steps": ((1, 2), 0.05, 0.01, 0.5, 0.2, 0.05),
+    }
+
+
 def test_orientations_of_either_sign_are_averaged():
     half = math.sqrt(0.5)
     poses = np.array([[0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.2], [2.0, 0.0, 1.0, -half, 0.0, 0.0, -half, 0.4]])
@@ -231,6 +244,7 @@ def test_the_figure_draws_errors_from_the_onset_on_and_torques_about_statics(tmp
     drawn = [line.get_ydata() for line in periodic_load.lines]
     np.testing.assert_allclose(drawn, [[0.0, 2.0], [-6.0] * 2, [8.0] * 2, [1.0, 3.0], [-3.0] * 2, [7.0] * 2])
     assert (tmp_path / "x.png").read_bytes().startswith(b"\x89PNG")
+    assert periodic_load.get_ylim() == (-13.0, 17.0)
     close(kept[0])
 
 
