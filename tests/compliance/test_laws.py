@@ -168,6 +168,7 @@ def test_bad_fields_are_named(field, value):
 @pytest.mark.parametrize(
     ("field", "low", "high"),
     [("null_stiffness", 0.1, 1e4), ("alpha", 0.0, 1.0), ("condition_threshold", 1.0, 1e9), ("soft_gain", 0.1, 1e4),
+     ("rotational_stiffness", 0.0, 1e4), ("characteristic_length", 1e-3, 1e3),
      ("virtual_mass", 0.01, 1e3), ("damping_ratio", 0.01, 100.0), ("reference_share", 0.01, 0.99),
      ("store_energy", 0.0, 1e6), ("store_power", 0.0, 1e6)],
 )  # fmt: skip
