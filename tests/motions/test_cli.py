@@ -84,3 +84,18 @@ def test_show_writes_a_plot_for_every_clip_and_a_sheet(tmp_path: Path, capsys):
     for name in ("punch", "walk"):
         assert (tmp_path / "out" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     assert (tmp_path / "out" / "contact_sheet.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["import", "a.csv"], "error: the following arguments are required: --output; cotap motions import --help"),
+        (["import", "--output", "o.npz"], "error: the following arguments are required: SOURCE"),
+        (["import", "a.csv", "--output", "o.npz", "--robot", "h2"], "error: argument --robot: invalid choice: 'h2'"),
+    ],
+)
+def test_a_command_line_that_lacks_something_is_answered_in_a_line(arguments: list[str], message: str, capsys):
+    assert main(arguments) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(message)
+    assert said.count("\n") == 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
+from typing import NoReturn
 
 from cotap.checks import shortened
 from cotap.files import require_output
@@ -14,31 +15,43 @@ from cotap.motions.library import MotionError, MotionLibrary, shipped_library
 from cotap.robots import ROBOTS
 
 
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong in a line, as all commands do."""
+
+    def error(self, message: str) -> NoReturn:
+        raise MotionError(f"{message}; {self.prog} --help shows the options")
+
+
 def make_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="cotap motions", description=__doc__)
+    """The parser of both commands."""
+    parser = _Parser(prog="cotap motions", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
     importer = commands.add_parser("import", description="Read motion files of any known format into one library.")
-    importer.add_argument("sources", nargs="+", type=Path, metavar="SOURCE", help="files, or folders to search")
-    importer.add_argument("--format", default="auto", choices=("auto", *FORMATS), help="format of the files")
+    importer.add_argument("sources", nargs="+", type=Path, metavar="SOURCE", help="Files, or folders to search.")
     importer.add_argument(
         "--output",
         type=Path,
         required=True,
         metavar="FILE",
-        help="the library to write (.npz); one of that name is replaced",
+        help="Library to write (.npz). It replaces one of that name.",
     )
-    importer.add_argument("--mirror", action="store_true", help="add the left-right mirror image of every clip")
-    importer.add_argument("--fps", type=float, metavar="HZ", help="frame rate of the files, in place of what they say")
-    importer.add_argument("--source", default="not stated", help="where the motion comes from, kept in the file")
-    importer.add_argument("--licence", default="not stated", help="its terms, kept in the file")
+    importer.add_argument(
+        "--format", default="auto", choices=("auto", *FORMATS),
+        help=f"Format of the files: {', '.join(FORMATS)} or auto. auto looks into each file. (default: auto)",
+    )  # fmt: skip
+    importer.add_argument("--mirror", action="store_true", help="Add the left-right mirror image of every clip.")
+    importer.add_argument("--fps", type=float, metavar="HZ", help="Frame rate of the files, in place of what they say.")
+    importer.add_argument("--source", default="not stated", help="Where the motion comes from. It is kept in the file.")
+    importer.add_argument("--licence", default="not stated", help="Licence of the motion. It is kept in the file.")
     shower = commands.add_parser("show", description="List a library's clips, and draw them if asked to.")
-    shower.add_argument("file", nargs="?", type=Path, metavar="FILE", help="a library; by default the shipped one")
-    shower.add_argument("--clip", action="append", default=[], help="only this clip (may be repeated)")
+    shower.add_argument("file", nargs="?", type=Path, metavar="FILE", help="Library. By default the shipped one.")
+    shower.add_argument("--clip", action="append", default=[], help="Only this clip. May be repeated.")
     shower.add_argument(
-        "--output", type=Path, metavar="DIR", help="draw the clips, seconds for each, and put the pictures here"
+        "--output", type=Path, metavar="DIR", help="Folder for pictures of the clips. Without it, nothing is drawn."
     )
     for command in (importer, shower):
-        command.add_argument("--robot", default="h1", choices=tuple(ROBOTS), help="whose arms they move")
+        arms = "Whose arms they move, such as g1. (default: h1)"
+        command.add_argument("--robot", default="h1", choices=tuple(ROBOTS), metavar="ROBOT", help=arms)
     return parser
 
 
@@ -76,8 +89,8 @@ def _show(options: argparse.Namespace) -> int:
 
 def main(arguments: list[str] | None = None) -> int:
     """Parse and run. Returns the exit status: 0, 2 for what the user can correct, or 130 if interrupted."""
-    options = make_parser().parse_args(arguments)
     try:
+        options = make_parser().parse_args(arguments)
         return {"import": _import, "show": _show}[options.command](options)
     except (ValueError, OSError) as error:
         print(f"error: {shortened(str(error))}", file=sys.stderr)
