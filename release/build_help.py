@@ -31,7 +31,7 @@ ABOUT = {
     "train": "train policies: of legs and arms (base), then under compliance (distill)",
     "evaluate": "measure a policy by a protocol",
     "compare": "say what differs between two evaluations, and whether it is better",
-    "play": "open a page on which a robot walks, is pushed, and has its stiffness turned",
+    "play": "open a page on which to push a robot and change the stiffness of its hands",
     "motions": "import motions, or show those of a library",
     "export": "write a policy as one ONNX file",
     "deploy": "run an exported policy on one robot, as on hardware, in an engine",
@@ -68,7 +68,9 @@ def build() -> dict[str, Command]:
         ),
         "compare": Command(purpose(CompareOptions), {}, options(CompareOptions, None)),
         "play": Command(purpose(PlayOptions), {}, options(PlayOptions, None)),
-        "motions": Command(ABOUT["motions"], {name: parser.description or "" for name, parser in motions.items()}),
+        "motions": Command(
+            "Import motions, or show those of a library.", {n: p.description or "" for n, p in motions.items()}
+        ),
         **{f"motions {n}": Command(p.description or "", {}, _of_parser(p)) for n, p in motions.items()},
         "export": Command(purpose(ExportOptions), {}, options(ExportOptions, None)),
         "deploy": Command(purpose(DeployOptions), {}, options(DeployOptions, None)),
@@ -110,13 +112,14 @@ def _option(action: argparse.Action) -> Option:
     value = "" if action.nargs == 0 or len(flags) == 2 else _value(str(action.metavar or action.dest.upper()))
     text, _, default = " ".join((action.help or "").split()).partition(" (default: ")
     default = default.removesuffix(")")
-    if action.nargs == 0 or len(flags) == 2:  # a switch that is off
-        default = default.replace("False", "")
+    if action.nargs == 0 or len(flags) == 2:  # a switch
+        default = {"True": "on", "False": ""}.get(default, default)
     dotted = bool(flags) and "." in flags[0] and flags[0] not in _OWN
     group = "laws" if title == "laws options" else "config" if dotted else ""
     if not flags:
-        value = action.dest.upper()
-    return Option(flags, value, text.replace(" (required)", ""), "" if default in _NOTHING else default, group)
+        value = f"{action.metavar} ..." if action.nargs == "+" else action.dest.upper()
+    text = text.replace(" (required)", "")
+    return Option(flags, value, text, "" if default in _NOTHING else default, group, action.required)
 
 
 def _title(action: argparse.Action) -> str:
@@ -125,7 +128,7 @@ def _title(action: argparse.Action) -> str:
 
 def _value(metavar: str) -> str:
     """What follows an option, without what no reader needs: `{None}|[FLOAT [FLOAT ...]]` is `FLOAT ...`."""
-    plain = metavar.replace("{None}|", "")
+    plain = metavar.replace("{None}|", "").replace("{None,True,False}", "True|False")
     many = re.fullmatch(r"\{?\[(\S+) \[\1 \.\.\.\]\]\}?", plain)
     return f"{many[1]} ..." if many else plain
 

@@ -67,9 +67,9 @@ def _table(command: Command) -> str:
 
 
 def _row(option: Option) -> str:
-    name = f"{option.flags[0] if option.flags else ''} {option.value}".strip()
-    default = f"`{option.default}`" if option.default else ""
-    return f"| `{name}` | {default} | {option.help} |".replace("<", "&lt;")
+    label = option.label.replace("|", "\\|")
+    note = option.note if option.required else f"`{option.note}`" if option.note else ""
+    return f"| `{label}` | {note} | {option.help} |".replace("<", "&lt;")
 
 
 def _outside() -> dict[str, str]:

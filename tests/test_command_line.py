@@ -107,12 +107,32 @@ def test_a_missing_package_is_named_with_its_cure(monkeypatch: pytest.MonkeyPatc
     assert "cotap compare needs tyro: pip install 'cotap[train]'" in capsys.readouterr().err
 
 
-def test_a_line_of_help_is_cut_before_its_default():
-    option = Option(("--size",), "FLOAT", "How large it is, " + "and so on, " * 20, "2.5")
-    line = show("x", Command("about", {}, (option,))).splitlines()[-3]
-    assert line.startswith("  --size FLOAT              How large it is, and")
-    assert line.endswith("... (2.5)")
-    assert len(line) <= 80
+def test_help_in_short_has_first_sentences_whole_and_help_in_full_all_of_them():
+    option = Option(
+        ("--size",), "FLOAT", "How large the box of 2.5 kg is, and not how heavy [m]. More of it.", "0.1 0.2"
+    )
+    shown = show("x", Command("about", {}, (option,))).splitlines()
+    assert shown[5] == "  --size FLOAT               How large the box of 2.5 kg is, and not how heavy"
+    assert shown[6] == " " * 29 + "[m]. (0.1 0.2)"
+    full = " ".join(show("x", Command("about", {}, (option,)), everything=True).split())
+    assert "[m]. More of it. (default: 0.1 0.2)" in full
+
+
+def test_help_names_what_must_be_given_and_how_a_switch_is_turned_off():
+    needed, on = Option(("--to",), "FILE", "Where.", required=True), Option(("--log", "--no-log"), "", "Log.", "on")
+    command = Command("about", {}, (Option((), "FROM", "What.", required=True), Option((), "AS", "How."), needed, on))
+    shown = show("x", command).splitlines()
+    assert shown[0] == "usage: cotap x FROM [AS] --to FILE [options]"
+    assert f"  {'--to FILE':27s}Where. (required)" in shown
+    assert f"  {'--[no-]log':27s}Log. (on)" in shown
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_first_sentences_of_options_take_two_lines_at_most(name: str):
+    for option in COMMANDS[name].options:
+        if not option.group:
+            lines = show(name, Command("about", {}, (option,))).splitlines()[5:-2]
+            assert len(lines) <= 2, "\n".join(lines)
 
 
 def test_a_name_that_resembles_nothing_gets_the_list():

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import difflib
 import json
+import re
 import textwrap
 from dataclasses import asdict, dataclass, field
 from importlib.resources import files
 
 WIDTH = 80
 """Columns of a screen."""
-_FIRST, _NARROW = 28, 20
+_FIRST, _NARROW = 29, 22
 """Columns of an option's name, and of a command's."""
+_JOINT = "\N{NO-BREAK SPACE}"
 
 
 @dataclass(frozen=True)
@@ -28,6 +30,21 @@ class Option:
     """Its default, as one would type it; empty if it has none."""
     group: str = ""
     """`laws` for the laws of the arms, `config` for a field of a training's config, empty for all else."""
+    required: bool = False
+    """Whether the command does nothing without it."""
+
+    @property
+    def label(self) -> str:
+        """Its name and what follows it; for a switch that is on, how to turn it off as well."""
+        name = self.flags[0] if self.flags else ""
+        if self.default == "on":
+            name = f"--[no-]{name[2:]}"
+        return f"{name} {self.value}".strip()
+
+    @property
+    def note(self) -> str:
+        """Its default, or that it must be given."""
+        return "required" if self.required and self.flags else self.default
 
 
 @dataclass(frozen=True)
@@ -68,7 +85,7 @@ def show(name: str, command: Command, everything: bool = False) -> str:
         text += ["", f"Options: cotap {name} NAME --help".replace("  ", " ")]
     options = [o for o in command.options if everything or not o.group]
     if options:
-        text += ["", "options:", *(_in_full(o) if everything else _one_line(o) for o in options)]
+        text += ["", "options:", *(_in_full(o) if everything else _in_short(o) for o in options)]
     if not everything:
         text += _left_out(command)
     return "\n".join(text)
@@ -82,12 +99,9 @@ def unknown(what: str, name: str, known: list[str]) -> str:
 
 
 def _usage(command: Command) -> str:
-    given = "".join(f" {o.value}" for o in command.options if not o.flags)
-    return (" NAME" if command.parts and not command.options else given) + " [options]"
-
-
-def _label(option: Option) -> str:
-    return f"{option.flags[0] if option.flags else ''} {option.value}".strip()
+    given = "".join(f" {o.label}" if o.required else f" [{o.label}]" for o in command.options if not o.flags)
+    needed = "".join(f" {o.label}" for o in command.options if o.flags and o.required)
+    return (" NAME" if command.parts and not command.options else given + needed) + " [options]"
 
 
 def _wrapped(label: str, about: str) -> str:
@@ -95,19 +109,23 @@ def _wrapped(label: str, about: str) -> str:
     return textwrap.fill(about, WIDTH, initial_indent=f"  {label:{_NARROW - 2}s}", subsequent_indent=indent)
 
 
-def _one_line(option: Option) -> str:
-    label = _label(option)
-    start = f"  {label:{_FIRST - 2}s}" if len(label) < _FIRST - 2 else f"  {label}  "
-    default = f" ({option.default})" if 0 < len(option.default) <= 12 else ""
-    return start + textwrap.shorten(option.help, WIDTH - len(start) - len(default), placeholder=" ...") + default
+def _in_short(option: Option) -> str:
+    """What an option is, in its first sentence: on a line or two beside its name."""
+    sentence = re.split(r"(?<=\.)\s", option.help, maxsplit=1)[0]
+    joined = option.note.replace(" ", _JOINT)  # stays on one line
+    note = f" ({joined})" if 0 < len(joined) <= 12 else ""
+    lines = textwrap.wrap(sentence + note, WIDTH - _FIRST, break_on_hyphens=False)
+    indent = "\n" + " " * _FIRST
+    label = f"  {option.label:{_FIRST - 2}s}"
+    return (label + ("" if label.endswith(" ") else indent) + indent.join(lines)).rstrip().replace(_JOINT, " ")
 
 
 def _in_full(option: Option) -> str:
     names = ", ".join(option.flags)
-    default = f" (default: {option.default})" if option.default else ""
+    note = "" if not option.note else " (required)" if option.note == "required" else f" (default: {option.note})"
     indent = " " * 8
     about = textwrap.fill(
-        option.help + default, WIDTH, break_on_hyphens=False, initial_indent=indent, subsequent_indent=indent
+        option.help + note, WIDTH, break_on_hyphens=False, initial_indent=indent, subsequent_indent=indent
     )
     return f"  {names} {option.value}".rstrip() + "\n" + about
 
@@ -123,5 +141,5 @@ def _left_out(command: Command) -> list[str]:
         ]
     fields = sum(o.group == "config" for o in command.options)
     if fields:
-        lines += ["", f"{fields} fields of the config, such as --ppo.clip"]
+        lines += ["", f"And {fields} options for fields of the configuration, such as --ppo.clip."]
     return [*lines, "", "Every option, in full: --help-all"] if command.options else lines

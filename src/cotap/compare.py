@@ -24,13 +24,13 @@ class CompareOptions:
     """Differences B - A of two evaluations of one protocol, with 95 % intervals."""
 
     a: Annotated[str, tyro.conf.Positional]
-    """An evaluation's JSON."""
+    """JSON of the first evaluation."""
     b: Annotated[str, tyro.conf.Positional]
-    """Another's."""
+    """JSON of the second evaluation."""
     without_falls: bool = False
-    """Compare the figures of envs that stood to the end."""
+    """Compare only the envs that did not fall."""
     json: str = ""
-    """Write the differences here."""
+    """Write the differences here (JSON)."""
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -27,37 +27,37 @@ from cotap.motions.reference import HELD
 
 @dataclass
 class DeployOptions:
-    """One robot as it would run on hardware: joint and IMU readings in, torque laws out.
+    """Run an exported policy on one robot, as on hardware: readings of joints and IMU in, torques out.
 
     Commands come from a scenario, from the keyboard, or are drawn at random as the velocity-tracking evaluation does.
     """
 
     policy: str
-    """What `cotap export` wrote."""
+    """ONNX file that `cotap export` wrote."""
     scenario: str = ""
-    """Commands, forces, arm motion and laws over time (TOML)."""
+    """File (TOML) of commands, forces, motion and laws."""
     keyboard: bool = False
-    """Commands from this terminal, in real time."""
+    """Steer from this terminal, in real time. The keys are printed at the start."""
     trials: int = 1
-    """Repeat so often, with other seeds, and sum up."""
+    """Number of trials, each with another seed."""
     episode_seconds: float | None = None
-    """How long a trial lasts, by default 20 s; a scenario says so itself [s]."""
+    """Length of a trial [s]. By default 20; a scenario has its own."""
     motion: str = HELD
-    """Clip that the arms follow, `mixture` for clips and generated motion as in training, or `none` to hold the default
-    pose. A scenario says so itself."""
+    """Clip for the arms, `mixture` or `none`. mixture: clips and generated motion, as in the training. none:
+    hold the default pose. A scenario has its own."""
     library: str = ""
-    """Motion library (.npz) that the clip is taken from; empty for the one that comes with the package."""
+    """Motion library (.npz) of the clip. By default the shipped one."""
     left: str = ""
-    """The left arm's law, such as cotap:alpha=0.7,stiffness=500; by default the scenario's, or that of training."""
+    """Law of the left arm, such as cotap:alpha=0.7,stiffness=500. By default the scenario's, or the training's."""
     right: str = ""
-    """The right arm's law."""
+    """Law of the right arm."""
     passive: bool = False
-    """Hold back changes of stiffness that would give away more energy than a store has, on arms under cotap. Not given,
-    it is as in the training, or as --left and --right say."""
+    """Give each arm under cotap an energy store. Changes of stiffness that would give away more than it has are held
+    back. By default as in the training, or as --left and --right say."""
     seed: int = 0
     """Seed of commands, motions and perturbations."""
     json: str = ""
-    """Write the result here."""
+    """Write the result here (JSON)."""
     video: str = ""
     """Write a video of the first trial here (MP4)."""
     engine: tyro.conf.OmitArgPrefixes[EngineConfig] = field(default_factory=EngineConfig)

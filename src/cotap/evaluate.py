@@ -66,20 +66,20 @@ class Options(Generic[P]):
     protocol: tyro.conf.OmitArgPrefixes[P]
     laws: tyro.conf.OmitArgPrefixes[LawOptions]
     checkpoint: str = ""
-    """Checkpoint to evaluate, a file or the name of a shipped one. By default the shipped base policy for
-    velocity-tracking, and for all others the shipped policy that was distilled under compliance, if there is one."""
+    """Policy to evaluate: a file, or a shipped policy's name. By default h1-base for velocity-tracking; for all others
+    h1-cotap, or h1-base as long as h1-cotap does not ship."""
     backend: str = "auto"
-    """What simulates: mujoco or mjbatch (the CPU), warp (a GPU), or auto: warp where there are a GPU and the extra
-    `warp`, else mjbatch where it is installed, else mujoco. Results are reproducible on one machine, on GPUs up to
-    rounding."""
+    """What simulates: mujoco, mjbatch (both on the CPU), warp (a GPU) or auto. auto takes warp if there is a GPU and
+    the extra `warp` is installed, else mjbatch if that is installed, else mujoco. Results are reproducible on one
+    machine, on GPUs up to rounding."""
     threads: int = 0
-    """Threads; 0 takes every core. Results are reproducible for one number."""
+    """CPU threads, 0 for every core. Results are reproducible for one number of threads."""
     json: str = ""
-    """Write the result here."""
+    """Write the result here (JSON)."""
     plot: str = ""
     """Write a plot here (PNG)."""
     video: str = ""
-    """Write a video of the first env here (MP4), of a series of commands for velocity-tracking; a contact sheet
+    """Write a video of the first env here (MP4). For velocity-tracking, it shows a series of commands. A contact sheet
     (NAME_frames.png) goes beside it."""
 
 
@@ -89,7 +89,7 @@ class RecordingOptions:
 
     protocol: tyro.conf.OmitArgPrefixes[RecordingProtocol]
     json: str = ""
-    """Write the result here."""
+    """Write the result here (JSON)."""
 
 
 def main(argv: list[str] | None = None) -> int:

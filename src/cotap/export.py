@@ -14,15 +14,16 @@ from cotap.files import require_output
 
 @dataclass
 class ExportOptions:
-    """Observation to joint targets, with the metadata that a robot's loop needs."""
+    """Write a policy as one ONNX file: from observation to joint targets, with the metadata that a robot's loop
+    needs."""
 
     output: str
-    """Where the ONNX file goes."""
+    """File to write (.onnx)."""
     checkpoint: str = ""
-    """Checkpoint to export, a file or the name of a shipped one; by default the shipped distilled policy, or else the
-    base."""
+    """Policy to export: a file, or a shipped policy's name. By default h1-cotap, or h1-base as long as h1-cotap does
+    not ship."""
     checks: int = 1000
-    """Observations over which the file is compared with torch before it is kept."""
+    """Observations on which to compare file and torch. The file is kept only if they agree."""
     seed: int = 0
     """Seed of those observations."""
 

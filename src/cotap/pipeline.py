@@ -22,13 +22,13 @@ class PipelineOptions:
     `cotap train base --help`, `cotap train distill --help`."""
 
     run_dir: str = ""
-    """Where the runs go, into folders `base` and `distill`; by default runs/cotap-DATE-TIME."""
+    """Folder of both runs. By default runs/cotap-DATE-TIME. It gets the folders `base` and `distill`."""
     robot: str = "h1"
     """Name of the robot."""
     quick: bool = False
-    """A small version of both: walking without loads and pushes, and the beginnings of compliance."""
+    """A small version of both stages. Walking is trained without loads and pushes, compliance only begun."""
     resume: bool = False
-    """Go on with the runs in --run-dir: what is finished is left, what was stopped goes on, what is missing begins."""
+    """Go on with the runs in --run-dir. A stage that is finished is not run again."""
     num_envs: int = 1024
     """Number of envs."""
     base_iterations: int = 0
@@ -38,12 +38,12 @@ class PipelineOptions:
     seed: int = 0
     """Seed of both stages."""
     threads: int = 0
-    """CPU threads; 0 takes every core."""
+    """CPU threads, 0 for every core."""
     backend: str = "auto"
-    """What simulates, in all stages: mujoco or mjbatch (the CPU), warp (a GPU), or auto: warp where there is one
-    and the extra `warp`, else mjbatch where it is installed, else mujoco."""
+    """What simulates: mujoco, mjbatch (both on the CPU), warp (a GPU) or auto. auto takes warp if there is
+    a GPU and the extra `warp` is installed, else mjbatch if that is installed, else mujoco."""
     device: str = "cpu"
-    """Where the networks live, in all stages."""
+    """Where the networks live, such as cpu or cuda."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""

@@ -52,13 +52,13 @@ class BaseOptions:
     """
 
     run_dir: str = ""
-    """Where the run goes; by default the folder of the run that is resumed, or else runs/base-DATE-TIME."""
+    """Folder of the run. By default that of the run that is resumed, or else runs/base-DATE-TIME."""
     resume: str = ""
-    """Checkpoint of a run to go on from; its config is the default for every option. auto: the newest in --run-dir, if
-    any."""
+    """Checkpoint to go on from, or auto. auto takes the newest in --run-dir, if there is one. The configuration of the
+    run is the default for every option."""
     recipe: str = "default"
-    """default (what ships), quick (walking in the shortest time), paper (the paper's settings) or facet (FACET's
-    tracking reward)."""
+    """default, quick, paper or facet. default is the full training, quick walks in the shortest time, paper has the
+    paper's settings, facet FACET's tracking reward."""
     command: tyro.conf.Suppress[str] = ""
     training: Annotated[BaseTraining, tyro.conf.arg(name="")] = field(default_factory=BASE_RECIPES["default"])
 
@@ -71,17 +71,17 @@ class DistillOptions:
     """
 
     run_dir: str = ""
-    """Where the run goes; by default the folder of the run that is resumed, or else runs/distill-DATE-TIME."""
+    """Folder of the run. By default that of the run that is resumed, or else runs/distill-DATE-TIME."""
     resume: str = ""
-    """Checkpoint of a distillation to go on from; its config is the default for every option. auto: the newest in
-    --run-dir, if any."""
+    """Checkpoint to go on from, or auto. auto takes the newest in --run-dir, if there is one. The configuration of the
+    run is the default for every option."""
     base_checkpoint: str = ""
-    """Base policy to begin from and to be guided by, a file or the name of a shipped one; by default the shipped
-    one."""
+    """Base policy to start from: a file, or a shipped policy's name. It guides the new policy as well. By default the
+    shipped base policy."""
     recipe: str = "default"
-    """default (80 to 1200 N/m); quick (its beginnings); paper (150 to 450 N/m); facet (arms under FACET, its tracking
-    reward); or an ablation: no-ratio, torque-critic, goals. The last two change what networks see; the base's are
-    refitted."""
+    """default, quick, paper, facet, no-ratio, torque-critic or goals. default: 80 to 1200 N/m. quick: a short default.
+    paper: 150 to 450 N/m. facet: arms under FACET, with its tracking reward. The others are ablations; the last two
+    change what the networks see, and the networks of the base are refitted."""
     command: tyro.conf.Suppress[str] = ""
     training: Annotated[DistillTraining, tyro.conf.arg(name="")] = field(default_factory=DistillTraining)
 

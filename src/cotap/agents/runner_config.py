@@ -12,7 +12,7 @@ class RunnerConfig:
     """How long to train and how often to save."""
 
     iterations: int = 400
-    """Iterations in all, those of a resumed run included."""
+    """Iterations in all, with those of a resumed run."""
     save_interval: int = 25
     """Iterations between checkpoints."""
     save_envs: bool = True

@@ -32,9 +32,9 @@ class BaseTraining:
     seed: int = 0
     """Seed of networks, exploration and environment."""
     threads: int = 0
-    """CPU threads of torch and physics; 0 takes every core. A run is reproducible for one number."""
+    """CPU threads, 0 for every core. A run is reproducible for one number of threads."""
     device: str = "cpu"
-    """Where the networks live; physics is where `env.backend` has it."""
+    """Where the networks live, such as cpu or cuda. --backend says where the physics lives."""
     env: HumanoidEnvConfig = field(default_factory=HumanoidEnvConfig)
     ppo: DualPPOConfig = field(default_factory=DualPPOConfig)
     runner: RunnerConfig = field(default_factory=RunnerConfig)

@@ -23,13 +23,13 @@ class EngineConfig:
     """How finely an engine simulates, and what it is wrong about."""
 
     engine: str = "mujoco"
-    """mujoco or pybullet."""
+    """Physics engine: mujoco or pybullet."""
     timestep: float = 0.001
     """Physics step [s]."""
     collision: str = "full"
-    """full (all shapes) or feet (feet against the floor; mujoco only)."""
+    """What collides: full (all shapes) or feet (with the floor). feet in mujoco alone."""
     cone: str = "elliptic"
-    """Friction cones: elliptic or pyramidal (mujoco only)."""
+    """Friction cones: elliptic or pyramidal. In mujoco alone."""
     friction: float = 1.0
     """Sliding friction between feet and floor."""
     torque_limit_scale: float = 1.0

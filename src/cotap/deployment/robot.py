@@ -25,17 +25,17 @@ class Perturbations:
     """What robots do. Drawn anew for every trial."""
 
     delay_steps: tuple[int, int] = (0, 0)
-    """Laws reach the motors late by a number of control steps between these."""
+    """Least and most control steps that laws are late."""
     drop: float = 0.0
-    """Chance that a reading is lost; the one before stands in for it."""
+    """Chance that a reading is lost. The one before takes its place."""
     encoder_noise: float = 0.0
-    """Half width of uniform noise on joint positions [rad]."""
+    """Most noise on joint positions, uniform [rad]."""
     velocity_noise: float = 0.0
-    """Half width of uniform noise on joint velocities [rad/s]."""
+    """Most noise on joint velocities, uniform [rad/s]."""
     mass_error: float = 0.0
-    """All masses are off by this share, up or down."""
+    """Largest share by which all masses are off."""
     start_error: float = 0.0
-    """Joints, and the base about x and y, start off by up to this [rad]."""
+    """Largest error of the first pose [rad]. Of joints, and of the base about x and y."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""

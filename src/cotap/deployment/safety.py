@@ -17,13 +17,13 @@ class SafetyConfig:
     """Start-up and safe stop."""
 
     ramp_s: float = 1.0
-    """Gains rise from nothing for so long while the base is held; 0 starts at once [s]."""
+    """Time in which gains rise from nothing [s]. The base is held meanwhile; 0 starts at once."""
     settle_s: float = 0.5
-    """How long the robot is then held under full gains before it is let go [s]."""
+    """Time under full gains before the base is let go [s]."""
     max_tilt: float = 1.0
-    """A torso tilted further than this is falling: stop [rad]."""
+    """Stop when the torso tilts further [rad]."""
     saturation_s: float = 1.0
-    """A joint at its torque limit for so long: stop [s]."""
+    """Stop when a joint is this long at its limit [s]. Its torque limit, without a break."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""

@@ -44,8 +44,8 @@ class HumanoidEnvConfig:
     seed: Annotated[int, tyro.conf.Suppress] = 0
     """Seed of the environment's own random numbers. A training sets it, as it does the threads."""
     backend: str = "auto"
-    """What simulates: mujoco (the CPU, MuJoCo alone), mjbatch (the CPU), warp (MuJoCo Warp; a GPU if there is one), or
-    auto: warp where there are a GPU and the extra `warp`, else mjbatch where it is installed, else mujoco."""
+    """What simulates: mujoco, mjbatch (both on the CPU), warp (a GPU) or auto. auto takes warp if there
+    is a GPU and the extra `warp` is installed, else mjbatch if that is installed, else mujoco."""
     num_threads: Annotated[int, tyro.conf.Suppress] = 0
     """Physics threads on the CPU; 0 takes every core."""
     collision: str = "full"

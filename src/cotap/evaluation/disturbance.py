@@ -33,27 +33,27 @@ class Impact(Scenario):
     """A push on a hand or the base, 500 N for 50 ms: errors of hand, arm and torso, torques, recovery, falls."""
 
     motion: tuple[str, ...] = (MIXTURE,)
-    """Clips that the arms follow, `mixture` for what the policy was trained on, or `none` to hold `arm_pose`."""
+    """Clips for the arms, `mixture` or `none`. mixture: as in the training. none: hold --arm-pose."""
     force: tuple[float, float, float] = (500.0, 0.0, 0.0)
-    """Along x, y and z of the heading frame [N]."""
+    """Force along x, y, z of the heading frame [N]."""
     hand: str = "left"
     """left, right or both."""
     place: str = "hand"
-    """hand, or base: at its centre of mass, and on no hand."""
+    """hand or base. A force on the base acts at its centre of mass."""
     duration: float = 0.05
     """How long the force lasts [s]."""
     random_direction: bool = False
-    """Turn the force about the vertical by a random angle."""
+    """Turn the force randomly about the vertical."""
     onset: float = 1.0
-    """When it sets in [s]."""
+    """When the force begins [s]."""
     window: tuple[float, float] = (0.0, 1.0)
-    """What is measured, from the onset [s]."""
+    """Measured time, from the onset [s]."""
     fall_seconds: float = 3.0
-    """Falls count up to this long after the onset [s]."""
+    """Falls count for this long from the onset [s]."""
     episode_seconds: float = 4.0
     """Length of the evaluation [s]."""
     per_env: bool = False
-    """Write every env's figures as well: `cotap compare` then compares env by env."""
+    """Write the figures of every env as well. `cotap compare` then compares env by env."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
@@ -171,15 +171,15 @@ class ConstantLoad(Impact):
     """A load on a hand, held, 50 N downward: errors of hand, arm and torso, torques, effective stiffness, falls."""
 
     motion: tuple[str, ...] = (HELD,)
-    """Clips that the arms follow, `mixture` for what the policy was trained on, or `none` to hold `arm_pose`."""
+    """Clips for the arms, `mixture` or `none`. mixture: as in the training. none: hold --arm-pose."""
     force: tuple[float, float, float] = (0.0, 0.0, -50.0)
-    """Along x, y and z of the heading frame [N]."""
+    """Force along x, y, z of the heading frame [N]."""
     duration: float = 1e5
     """How long the force lasts [s]."""
     window: tuple[float, float] = (2.0, 4.0)
-    """What is measured, from the onset [s]."""
+    """Measured time, from the onset [s]."""
     fall_seconds: float = 4.0
-    """Falls count up to this long after the onset [s]."""
+    """Falls count for this long from the onset [s]."""
     episode_seconds: float = 5.0
     """Length of the evaluation [s]."""
 

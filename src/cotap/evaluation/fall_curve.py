@@ -19,20 +19,20 @@ from cotap.evaluation.rollout import Trajectory
 
 @dataclass
 class FallCurve(Impact):
-    """Fall rate against impulse, from nothing to `impulse`, and the impulse at which half of the envs fall."""
+    """Fall rate against impulse, from nothing to --impulse, and the impulse at which half of the envs fall."""
 
     force: tuple[float, float, float] = (1.0, 0.0, 0.0)
-    """Direction along x, y and z of the heading frame; its length does not count."""
+    """Direction, heading frame. Its length does not count."""
     random_direction: bool = True
-    """Turn the force about the vertical by a random angle."""
+    """Turn the force randomly about the vertical."""
     duration: float = 0.1
     """How long the force lasts [s]."""
     impulse: float = 75.0
     """Largest impulse [N s]."""
     levels: int = 16
-    """Number of impulses, from zero to the largest; envs are dealt to them evenly."""
+    """Number of impulses, from zero to the largest. Envs are dealt to them evenly."""
     window: tuple[float, float] = (0.0, 3.0)
-    """What is measured, from the onset [s]."""
+    """Measured time, from the onset [s]."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""

@@ -38,21 +38,22 @@ class Fidelity(HeldLoad):
     drives: ClassVar[dict[str, str]] = {"stiffness": "--stiffness-values"}
 
     num_envs: int = 192
-    """Number of envs, dealt to stiffnesses, axes and poses: with 4 stiffnesses 12 envs a pose."""
+    """Number of envs. They are dealt to stiffnesses, axes and poses: with 4 stiffnesses, a pose takes 12."""
     stiffness_values: tuple[float, ...] = (100.0, 200.0, 400.0, 800.0)
-    """Hand stiffnesses, on all axes [N/m]; they take the place of `--stiffness`."""
+    """Hand stiffnesses, in place of --stiffness [N/m]."""
     displacement: float = 0.02
-    """How far the load should move the hand, at most 0.05 [m]."""
+    """How far the load should move the hand [m]. At most 0.05."""
     condition: float = 8.0
-    """Largest condition number of the hand's Jacobian among the poses."""
+    """Largest condition number of the poses' Jacobians."""
     library: str = ""
-    """Motion library (.npz) that poses are drawn from; empty takes the one that comes with the package."""
+    """Motion library (.npz) that poses are drawn from. By default the shipped one."""
     pelvis: str = "free"
-    """free: on its legs, under the policy. fixed: held in the air, without a policy."""
+    """free, or fixed in the air, without a policy."""
     upper_actions: str = "policy"
-    """What moves the arms (pelvis free): policy, or reference for the raw reference instead of its upper actions."""
+    """What moves the arms: policy or reference. reference leaves out the policy's own arm actions. With --pelvis free
+    alone."""
     settle_seconds: float = 6.0
-    """How long the robot is left to settle without the load, then with it; the last second of each is measured [s]."""
+    """Time to settle, without the load and again with it [s]. The last second of each is measured."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""

@@ -21,17 +21,17 @@ class LawOptions:
     policy that was trained under PD has the protocol's own law, if it has one."""
 
     method: str | None = None
-    """Upper-body law of both arms: pd, soft-pd, cotap, facet, cotap+facet, cotap+facet-matched, hmc or dcc."""
+    """Law of both arms: pd, soft-pd, cotap, facet, cotap+facet, cotap+facet-matched, hmc or dcc."""
     stiffness: tuple[float, ...] | None = None
     """Hand stiffness, one number or X Y Z, heading frame [N/m]."""
     null_stiffness: float | None = None
     """Stiffness of arm motion that leaves the hand where it is [Nm/rad]."""
     alpha: float | None = None
-    """Share of compliance in its blend with PD (cotap, hmc)."""
+    """Share of compliance in the blend with PD, 0 to 1 (cotap, hmc). cotap blends stiffness, hmc torque."""
     error: str | None = None
-    """What stiffness acts on: joint or task error."""
+    """What stiffness acts on: joint, or task (the error of the hand)."""
     damping: str | None = None
-    """pd or critical."""
+    """Damping of the arm: pd or critical."""
     virtual_mass: float | None = None
     """Mass of the hand's model [kg] (facet, hmc)."""
     damping_ratio: float | None = None
@@ -41,10 +41,10 @@ class LawOptions:
     reference_share: float | None = None
     """Share of the compliance that the moving reference provides (cotap+facet-matched)."""
     passive: bool = False
-    """Hold back changes of stiffness that would give away more energy than a store has (cotap). Not given, it is as
-    in the training."""
+    """Hold back changes of stiffness that would give away more energy than a store has (cotap). By default as in
+    the training."""
     torso_compliance: str | None = None
-    """What is put down to the torso: none, constant or support."""
+    """Model of how far the torso yields: none, constant or support. The arm provides the rest of the compliance."""
     left: str = ""
     """A law for the left arm alone, such as cotap:alpha=0.7,stiffness=500."""
     right: str = ""

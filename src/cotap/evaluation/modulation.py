@@ -28,19 +28,20 @@ class Modulation(ConstantLoad):
     drives: ClassVar[dict[str, str]] = {"stiffness": "--stiffness-range", "alpha": "--alpha-range"}
 
     change: str = "both"
-    """step: from one end to the other at once. ramp: there and back evenly. both: every other env each."""
+    """step, ramp or both. step goes from one end to the other at once, ramp there and back evenly; both gives every
+    other env one of them."""
     stiffness_range: tuple[float, float] = (80.0, 1200.0)
-    """Hand stiffness on all axes, ramped evenly in its logarithm [N/m]."""
+    """Softest and stiffest hand [N/m]. All axes are alike; a ramp is even in the logarithm."""
     alpha_range: tuple[float, float] = (0.0, 1.0)
-    """Share of compliance."""
+    """Least and largest share of compliance."""
     period: float = 1.0
-    """From one end of the stiffness and back [s]; alpha takes the golden ratio of it, so that all pairs occur."""
+    """Time from one end of the stiffness and back [s]. Alpha takes the golden ratio of it, so that all pairs occur."""
     force: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """A load that is held, along x, y and z of the heading frame [N]; zero for none."""
+    """Load that is held, heading frame [N]. Zero for none."""
     window: tuple[float, float] = (0.0, 9.0)
-    """What is measured, from the onset [s]."""
+    """Measured time, from the onset [s]."""
     fall_seconds: float = 9.0
-    """Falls count up to this long after the onset [s]."""
+    """Falls count for this long from the onset [s]."""
     episode_seconds: float = 10.0
     """Length of the evaluation [s]."""
 

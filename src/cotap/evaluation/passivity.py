@@ -83,29 +83,29 @@ class Passivity(Stance):
     }  # fmt: skip
 
     num_envs: int = 480
-    """Number of exciters, dealt evenly to the laws and the ways of commanding stiffness."""
+    """Number of exciters. They are dealt evenly to the laws and the ways of commanding stiffness."""
     randomize: bool = False
-    """Domain randomization."""
+    """Vary masses, friction, gains and delay."""
     pelvis: str = "fixed"
-    """free, or fixed: held in the air, without a policy."""
+    """free, or fixed in the air, without a policy."""
     upper_actions: str = "reference"
-    """What moves the arms: policy, or reference for the raw reference in place of the policy's upper actions."""
+    """What moves the arms: policy or reference. reference leaves out the policy's own arm actions."""
     compared: tuple[str, ...] = (
         "pd", "cotap", "cotap:passive=true", "cotap:damping=pd", "cotap:damping=pd,passive=true", "facet", "hmc", "dcc",
     )  # fmt: skip
-    """Laws, each on both arms, such as cotap:passive=true,store_energy=1."""
+    """Laws, such as cotap:passive=true,store_energy=1. Each is on both arms."""
     generations: int = 5
-    """Of the search for the best exciter of each law and way of commanding stiffness."""
+    """Generations of the search for the best exciter. Each law and way of commanding stiffness has its own."""
     episode_seconds: float = 4.0
-    """How long an exciter has [s]."""
+    """Time that an exciter has [s]."""
     settle_seconds: float = 2.0
-    """Rest before it [s]."""
+    """Rest before the exciter begins [s]."""
     force_size: float = 15.0
     """Largest force that pulls the left hand [N]."""
     brake: float = 40.0
-    """Largest coefficient of the force that brakes the hand [Ns/m]."""
+    """Largest damping that brakes the hand [Ns/m]."""
     stiffness_range: tuple[float, float] = (80.0, 1200.0)
-    """Softest and stiffest hand that may be commanded, on all axes [N/m]."""
+    """Softest and stiffest hand [N/m]."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""

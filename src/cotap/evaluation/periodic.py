@@ -31,15 +31,15 @@ class PeriodicLoad(Scenario):
     laws: ClassVar[LawOptions] = LawOptions(left="cotap:alpha=0.7,stiffness=500", right="pd")
 
     force: tuple[float, float, float] = (0.0, 0.0, 30.0)
-    """Amplitude along x, y and z of the heading frame [N]."""
+    """Amplitude along x, y, z of the heading frame [N]."""
     hand: str = "both"
     """left, right or both."""
     period: float = 4.0
-    """[s]."""
+    """Period of the load [s]."""
     periods: int = 3
-    """How many; all but the first are measured."""
+    """Number of periods. All but the first are measured."""
     onset: float = 1.0
-    """When it sets in [s]."""
+    """When the load begins [s]."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""

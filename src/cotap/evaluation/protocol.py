@@ -39,7 +39,7 @@ class Protocol(ABC):
     torque_limit_scale: float = 1.0
     """Factor on the robot's torque limits."""
     randomize: bool = True
-    """Domain randomization."""
+    """Vary masses, friction, gains and delay."""
 
     def __post_init__(self) -> None:
         self.film = torch.zeros(0, 0)
@@ -99,14 +99,13 @@ class RolloutProtocol(Protocol):
     """A protocol that measures what it recorded of one rollout, in which arms may move."""
 
     motion: tuple[str, ...] = (MIXTURE,)
-    """Clips that the arms follow, `mixture` for what the policy was trained on, or `none` to hold `arm_pose`."""
+    """Clips for the arms, `mixture` or `none`. mixture: as in the training. none: hold --arm-pose."""
     arm_pose: tuple[float, ...] = ()
-    """Arm joints that are held [rad], as of the left arm; the right arm takes the mirror image. Empty for the default
-    pose."""
+    """Arm joints to hold, as of the left arm [rad]. The right arm mirrors it. By default the default pose."""
     library: str = ""
-    """Motion library (.npz) that clips are taken from; empty keeps the policy's."""
+    """Motion library (.npz) of the clips. By default that of the policy."""
     upper_actions: str = "policy"
-    """What moves the arms: policy, or reference for the raw reference in place of the policy's upper actions."""
+    """What moves the arms: policy or reference. reference leaves out the policy's own arm actions."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""

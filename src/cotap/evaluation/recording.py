@@ -179,9 +179,9 @@ class RecordingProtocol:
     file: str = ""
     """The recording (.npz)."""
     window_seconds: float = 1.0
-    """How long after the first force on a hand that force's effects are measured [s]."""
+    """Time measured after the first force on a hand [s]."""
     settle_seconds: float = 1.0
-    """Velocity errors are measured once a command has held for this long [s]."""
+    """Time a command must have held to be measured [s]."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""

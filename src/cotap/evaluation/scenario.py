@@ -21,13 +21,13 @@ class Stance(Protocol, ABC):
     """A robot that stands, walks or hangs in the air."""
 
     mode: str = "stance"
-    """stance, or walking forward at `speed`."""
+    """stance, or walking forward at --speed."""
     speed: float = 0.5
     """Forward command while walking [m/s]."""
     pelvis: str = "free"
-    """free, or fixed: held in the air, without a policy, to see the arms alone."""
+    """free, or fixed in the air, without a policy. Fixed shows the arms alone."""
     unevenness: float = 0.0
-    """Height of the ground's bumps from lowest to highest [m]; 0 is flat."""
+    """Height of bumps of the ground [m]. From the lowest to the highest point; 0 is flat."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
@@ -62,4 +62,4 @@ class Scenario(RolloutProtocol, Stance, ABC):
     """A robot that stands or walks while its arms hold a pose or follow a motion."""
 
     motion: tuple[str, ...] = (HELD,)
-    """Clips that the arms follow, `mixture` for what the policy was trained on, or `none` to hold `arm_pose`."""
+    """Clips for the arms, `mixture` or `none`. mixture: as in the training. none: hold --arm-pose."""

@@ -32,27 +32,27 @@ class Stability(Protocol):
     """Linearised closed loop of an arm's law over random poses, and the energy that can be drawn from it."""
 
     num_envs: int = 256
-    """Trials of energy: in half of them the stiffness changes meanwhile."""
+    """Trials of energy. In half of them the stiffness changes."""
     randomize: bool = False
-    """Domain randomization, of the trials of energy."""
+    """Vary masses, friction, gains and delay. In the trials of energy."""
     poses: int = 10_000
-    """Arm poses to linearise at, uniform within the joints' limits."""
+    """Arm poses to linearise at, within the joints' limits."""
     walls: tuple[float, ...] = (0.0, 100.0, 1000.0, 10000.0)
-    """Springs that hold the hand while it is linearised; 0 leaves it free [N/m]."""
+    """Springs that hold the hand, 0 for none [N/m]. The loop is linearised with each."""
     load_rad: float = 0.1
-    """Standard deviation of joint errors at which loops are linearised as well, as a load makes them [rad]."""
+    """Standard deviation of joint errors, as under a load [rad]. Loops are linearised with them, too."""
     episode_seconds: float = 5.0
     """Length of a trial [s]."""
     settle_seconds: float = 6.0
-    """Rest before it [s]."""
+    """Rest before a trial [s]."""
     force_size: float = 10.0
-    """Amplitude of the swinging force on each hand, in a random direction [N]."""
+    """Amplitude of the swinging force on each hand [N]. Its direction is random."""
     frequency: tuple[float, float] = (0.2, 8.0)
-    """Of the force, log-uniform [Hz]."""
+    """Range of the force's frequency, log-uniform [Hz]."""
     change_factor: float = 4.0
-    """Stiffness changes between 1 / sqrt(factor) and sqrt(factor) of the one commanded."""
+    """Factor by which stiffness changes, about the commanded one. From 1 / sqrt(factor) to sqrt(factor) of it."""
     change_seconds: float = 0.5
-    """How long it stays there [s]."""
+    """Time between two changes of stiffness [s]."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""

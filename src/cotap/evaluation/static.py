@@ -26,15 +26,16 @@ class HeldLoad(Stance):
     """What the protocols have in common that load one hand and let it settle."""
 
     randomize: bool = False
-    """Domain randomization."""
+    """Vary masses, friction, gains and delay."""
     hand: str = "left"
     """left or right."""
     pelvis: str = "fixed"
-    """fixed: held in the air, without a policy. free: on its legs, under the policy."""
+    """free, or fixed in the air, without a policy."""
     upper_actions: str = "reference"
-    """What moves the arms (pelvis free): policy, or reference for the raw reference instead of its upper actions."""
+    """What moves the arms: policy or reference. reference leaves out the policy's own arm actions. With --pelvis free
+    alone."""
     settle_seconds: float = 10.0
-    """How long the robot is left to settle without the load, then with it; the last second of each is measured [s]."""
+    """Time to settle, without the load and again with it [s]. The last second of each is measured."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
@@ -64,16 +65,16 @@ class HeldLoad(Stance):
 
 @dataclass
 class StaticStiffness(HeldLoad):
-    """Commanded against effective stiffness of a hand under loads from nothing to `force`."""
+    """Commanded against effective stiffness of a hand under loads from nothing to --force."""
 
     num_envs: int = 11
     """Number of envs, dealt to the loads evenly."""
     force: tuple[float, float, float] = (0.0, 0.0, -10.0)
-    """Full load along x, y and z of the heading frame [N]."""
+    """Full load along x, y, z of the heading frame [N]."""
     levels: int = 11
     """Number of loads, from zero to full."""
     arm_pose: tuple[float, ...] = ()
-    """Arm joints [rad], as of the left arm; the right arm takes the mirror image. Empty for the default pose."""
+    """Arm joints, as of the left arm [rad]. The right arm mirrors it. By default the default pose."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""

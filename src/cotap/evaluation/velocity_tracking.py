@@ -29,7 +29,7 @@ class VelocityTracking(RolloutProtocol):
     command_seconds: float = 5.0
     """How long each command is held [s]."""
     settle_seconds: float = 1.0
-    """Errors are measured once a command has held for this long [s]."""
+    """Time a command must have held to be measured [s]."""
     speed_x: float = 1.0
     """Largest forward and backward command [m/s]."""
     speed_y: float = 0.5
@@ -37,16 +37,16 @@ class VelocityTracking(RolloutProtocol):
     yaw_rate: float = 0.8
     """Largest turning command [rad/s]."""
     height_drop: float = 0.2
-    """Lowest stance below nominal [m]."""
+    """How far below nominal height stances go [m]."""
     stand_probability: float = 0.2
-    """Share of commands that ask the robot to stand."""
+    """Share of commands that are to stand."""
     hand_loads: bool = False
-    """Random loads on both hands in every episode: x and y up to 40 N, z from -50 to 5 N, held for 3 to 5 s."""
+    """Put random loads on both hands. x and y up to 40 N, z from -50 to 5 N, held for 3 to 5 s."""
     follow_path: bool = False
-    """Lead the torso along the clips' root path instead of drawing velocity commands."""
+    """Lead the torso along the root path of the clips. This takes the place of random commands."""
     collision: str = ""
-    """feet (only feet meet the floor) or full (all shapes, each other too); empty keeps what the policy was trained
-    with."""
+    """What collides: feet (with the floor) or full (all shapes). By default as in the training. With full, shapes also
+    meet each other."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""

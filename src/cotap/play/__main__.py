@@ -24,19 +24,19 @@ if TYPE_CHECKING:
 
 @dataclass
 class PlayOptions:
-    """A page on which a robot walks, is pushed, and has its stiffness turned."""
+    """Open a page on which to push a robot and change the stiffness of its hands."""
 
     host: str = "127.0.0.1"
-    """Address to listen at: 127.0.0.1 for this machine only, 0.0.0.0 for others, too; the URL then has a token."""
+    """Address to listen at. 127.0.0.1 is this machine only; 0.0.0.0 lets others in, and the URL then has a token."""
     port: int = 8080
     """Port to listen at."""
     checkpoint: tuple[str, ...] = ()
-    """Checkpoints of one robot, files or names of shipped ones, to choose from beside its shipped ones; the first of
-    these runs at first."""
+    """Policies to choose from: files, or shipped policies' names. They are all of one robot; the first of them runs at
+    first, and the robot's shipped policies can be chosen as well."""
     robot: str = ""
-    """Robot whose shipped policies run, by default h1. Checkpoints and recordings have their own."""
+    """Robot whose shipped policies run. By default h1. Checkpoints and recordings name their own."""
     library: str = ""
-    """Motion library (.npz) of the clips to choose from; empty for the first policy's."""
+    """Motion library (.npz) to choose clips from. By default that of the first policy."""
     replay: str = ""
     """Show this recording (.npz) instead of simulating."""
     output: str = "runs/play"

@@ -43,20 +43,21 @@ class Tour(Protocol):
     laws_for_all: ClassVar[bool] = True
 
     num_envs: int = 512
-    """Number of runs; each is a tour of its own, the same in every engine."""
+    """Number of runs, each a tour of its own. A run is the same tour in every engine."""
     randomize: bool = False
-    """Domain randomization."""
+    """Vary masses, friction, gains and delay."""
     upper_actions: str = "reference"
-    """What moves the arms: reference, the tour's own random walk, or policy, which adds the policy's upper actions."""
+    """What moves the arms: reference or policy. reference is the tour's own random walk; policy adds the policy's
+    own arm actions to it."""
     force_size: float = 500.0
-    """Ceiling of the punches after 60 s [N]; it is a third of that at first, and punches are half to all of it."""
+    """Ceiling of the punches after 60 s [N]. It is a third of that at first; punches are half to all of it."""
     waypoints: int = 18
-    """How many; there are as many punches."""
+    """Number of waypoints, and of punches."""
     episode_seconds: float = 90.0
-    """Time for all of them [s]."""
+    """Length of a tour, which all waypoints share [s]."""
 
     engine: str = "mujoco"
-    """mujoco, with all runs at once, or pybullet, one run after the other in the loop of `cotap deploy`."""
+    """mujoco or pybullet. mujoco runs all at once, pybullet one after the other in the loop of `cotap deploy`."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
