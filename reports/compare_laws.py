@@ -353,6 +353,8 @@ class Properties:
                   "|---|---|---|---|---|---|"]  # fmt: skip
         for name, row in result["rows"].items():
             for key, e in row["energy"].items():
+                if not e["share_drawn"] and not e["num_diverged"]:
+                    continue
                 least = " | ".join(
                     "-" if e[k] is None else f"{e[k]:+.4f}" for k in ("mean_least_energy", "least_energy")
                 )
@@ -360,11 +362,15 @@ class Properties:
                     f"| {name} | {key.split('_')[0]} | {least} | {e['share_drawn']:.1%} of {e['trials']} "
                     f"| {e['num_diverged']} |"
                 )
+        energy = (
+            "The second table has the laws that gave energy away under random swinging forces, or diverged; "
+            "properties.json has all. `cotap evaluate passivity` searches for the forces that draw most."
+        )
         wrong = (
             f"a wrong model has joint offsets and centres of mass {self.wrong_length:g} times as far out and masses "
             f"{self.wrong_mass:g} times as large as they are, but for each arm's first link; rotational inertias stay."
         )
-        return "\n".join([*lines, "", f"{self.stability.poses} poses; {wrong}"])
+        return "\n".join([*lines, "", f"{energy} {self.stability.poses} poses; {wrong}"])
 
     def draw(self, result: dict[str, Any]) -> Any:
         """Bars per law."""
