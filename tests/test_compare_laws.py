@@ -70,7 +70,16 @@ def test_properties_table(tmp_path):
     assert "a wrong model has joint offsets and centres of mass 1.1 times as far out" in text
     assert row["wrong_over_right_displacement"] != pytest.approx(1.0, abs=1e-3)
     assert "| yes / no / no |" in text  # the paper's
-    assert "| facet | changing | " in text
+    energy = row["energy"]["changing_stiffness"]
+    assert ("| facet | changing | " in text) == bool(energy["share_drawn"] or energy["num_diverged"])
+
+
+def test_the_page_of_the_properties_is_the_table_of_its_numbers():
+    page = Path(__file__).parents[1] / "docs/laws/properties.md"
+    table = compare_laws.Properties().table(json.loads(page.with_suffix(".json").read_text()))
+    assert page.read_text() == table + "\n"
+    assert "| facet | changing | -0.0210 | -2.6872 | 0.8% of 128 | 0 |" in table  # by hand, from the JSON
+    assert "| pd | changing | " not in table  # gave nothing away
 
 
 @pytest.mark.parametrize(
