@@ -13,12 +13,12 @@ from cotap.envs.commands import Command
 from cotap.envs.rewards import (
     LowerRewards,
     RewardGroup,
-    RobotScales,
     StepRecord,
     UpperRewards,
     reward_group,
     term,
 )
+from cotap.envs.scales import RobotScales
 from cotap.envs.state import RobotState
 from cotap.motions.generator import ArmReference
 
@@ -81,6 +81,8 @@ def perfect() -> StepRecord:
         key_velocities_reference_t=torch.zeros(1, 2, 3),
         mean_error=torch.zeros(1, 3),
         fell=torch.tensor([False]),
+        hand_force_w=torch.zeros(1, 1, 3),
+        hand_push_w=torch.zeros(1, 1, 3),
         scales=SCALES,
     )
 
@@ -120,6 +122,9 @@ def test_a_perfect_step(name):
 
 STANDING = {"stand": [1.0]}  # still moving at (0.5, -0.2) m/s: heading to a point (0.15, -0.06) m on
 TURNED_IN = torch.tensor([[[math.cos(0.3), -math.sin(0.3), 0.0], [1.0, 0.0, 0.0]]])
+OFF = {"key_points_t": [[[0.23, 0.24, 0.1], [0.2, -0.2, 0.1]]]}
+PUSHED = {"hand_force_w": [[[0.0, 25.0, 0.0]]], "hand_push_w": [[[0.0, 25.0, 0.0]]],
+          "torso_rotation_w": matrix_about_z(math.pi / 2)}  # fmt: skip
 CASES = [
     ("track_velocity", {"torso_linear_velocity_h": [[0.2, 0.2, 0.0]]}, math.exp(-(0.09 + 0.16) / 0.25)),
     ("track_velocity", {"torso_linear_velocity_h": [[0.5, -0.2, 9.0]]}, 1.0),
@@ -171,6 +176,18 @@ CASES = [
     ("stand_still", {"joint_vel": [[1.0, 2.0, 0.0, 9.0, 9.0]]}, 0.0),
     ("lower_torque", {"torque": [[1.0, -2.0, 3.0, 50.0, 50.0]]}, 14.0),
     ("upper_torque", {"torque": [[50.0, 50.0, 50.0, 2.0, -3.0]]}, 13.0),
+    # The hand is 0.05 m off; a push of 25 N to the left meets a torso that faces left: it comes from behind.
+    ("free_hand_error", OFF, 0.05),
+    ("free_hand_error", {**OFF, "hand_force_w": [[[0.0, 0.0, -9.0]]]}, 0.0),
+    ("free_hand_error", {**OFF, **PUSHED}, 0.0),
+    ("loaded_hand_error", OFF, 0.0),
+    ("loaded_hand_error", {**OFF, "hand_force_w": [[[0.0, 0.0, -9.0]]]}, 0.05),
+    ("loaded_hand_error", {**OFF, **PUSHED, "hand_force_w": [[[0.0, 25.0, -9.0]]]}, 0.0),
+    ("push_resistance", PUSHED, 25.0),
+    ("push_resistance", {**PUSHED, **OFF}, 25.0 - 150.0 * 0.03),
+    ("push_resistance", {**PUSHED, **OFF, "torso_rotation_w": torch.eye(3)[None]}, 25.0 - 150.0 * 0.04),
+    ("push_resistance", {**PUSHED, "key_points_t": [[[0.9, 0.2, 0.1], [0.2, -0.2, 0.1]]]}, 0.0),
+    ("push_resistance", {**PUSHED, "hand_force_w": [[[0.0, 25.0, -9.0]]]}, 0.0),
     ("lower_acceleration", {"joint_acceleration": [[1.0, -2.0, 3.0, 50.0, 50.0]]}, 14.0),
     ("upper_acceleration", {"joint_acceleration": [[50.0, 50.0, 50.0, 2.0, -3.0]]}, 13.0),
     ("lower_action_rate", {"action": [[1, 2, 3, 9, 9.0]], "last_action": [[2, 2, 1, 0, 0.0]]}, 5.0),

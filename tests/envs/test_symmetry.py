@@ -6,10 +6,13 @@ import pytest
 import torch
 from env_tools import NOISY, NOMINAL, zeros
 
+from cotap.compliance.laws import LawConfig
 from cotap.envs.external_forces import ExternalForceConfig
+from cotap.envs.modulation import ModulationConfig
 from cotap.envs.observations import ObservationConfig
 from cotap.envs.scripted_forces import ForceProfile
 from cotap.envs.symmetry import joint_reflection
+from cotap.envs.upper_body import UpperBodyConfig
 
 
 def test_joint_reflection_by_hand_for_the_h1(spec):
@@ -38,8 +41,9 @@ def test_joint_reflection_by_name(any_spec):
         ObservationConfig(arm_torque="critic", goals=True, history=3),
     ],
 )
-def test_reflections_fit_and_undo_themselves(make_env, robot, rng, observations):
-    env = make_env(2, robot=robot, observations=observations)
+@pytest.mark.parametrize("kind", ["none", "alpha", "stiffness"])
+def test_reflections_fit_and_undo_themselves(make_env, robot, rng, observations, kind):
+    env = make_env(2, robot=robot, observations=observations, upper_body=modulated(kind))
     for group, observed in env.get_observations().items():
         reflect = env.symmetry.observations[group]
         assert reflect.index.numel() == observed.shape[1]
@@ -53,7 +57,8 @@ def test_reflections_fit_and_undo_themselves(make_env, robot, rng, observations)
 def mirrored_pair(make_env, robot: str, **fields):
     """Two envs that start as mirror images; the H1's own left and right differ in the seventh digit."""
     env = make_env(2, robot=robot, randomization=NOMINAL, **fields)
-    reflect, joints, lower = env.symmetry.actions, env.num_actions, env.num_lower
+    joints, lower = len(env.spec.joints), env.num_lower
+    reflect = joint_reflection(env.spec, env.spec.joint_names)
     sign = torch.tensor([1.0, -1.0])
     arms = env.joint_targets.default + 0.2 * torch.linspace(-1.0, 1.0, joints)
     env.motions.hold(torch.stack((arms, reflect(arms)))[:, lower:])
@@ -87,6 +92,12 @@ def mirrored_steps(env, steps: int):
         yield obs, extras
 
 
+def modulated(kind: str) -> UpperBodyConfig:
+    """Arms under one law each, of which the policy sets what `kind` says."""
+    law = LawConfig("cotap", (500.0, 300.0, 200.0), alpha=0.5)
+    return UpperBodyConfig(law, law, modulation=ModulationConfig(kind))
+
+
 LOAD = ExternalForceConfig(scripted=ForceProfile((4.0, 0.0, -8.0), "both", 0.0))
 
 
@@ -108,6 +119,22 @@ def test_a_mirrored_step_is_mirrored(make_env, robot, forces):
         for name, function in group.terms.items():
             here, there = function(env.record).tolist()
             assert here == pytest.approx(there, rel=10 * atol, abs=0.1 * atol), name
+
+
+@pytest.mark.parametrize("kind", ["alpha", "stiffness"])
+def test_a_step_is_mirrored_with_the_laws_that_it_sets(make_env, robot, kind):
+    """Actions large enough for every law to move as far as a step lets it."""
+    atol = {"h1": 0.04, "g1": 0.04, "made-up": 1e-3}[robot]
+    env = mirrored_pair(make_env, robot, observations=ObservationConfig(history=1), upper_body=modulated(kind))
+    obs, _ = next(mirrored_steps(env, 1))
+    torch.testing.assert_close(
+        env.symmetry.observations["policy"](obs["policy"][0]), obs["policy"][1], atol=atol, rtol=0.03
+    )
+    p = env.upper_body.parameters
+    for value in (p.alpha, p.stiffness):
+        assert torch.equal(value[0], value[1].flip(0))
+    assert not torch.equal(p.alpha[0], p.alpha[1])
+    assert torch.equal(p.stiffness[0], p.stiffness[1]) == (kind == "alpha")
 
 
 def test_mirrored_robots_stay_mirrored(make_env, robot):

@@ -74,6 +74,8 @@ class ExternalForces:
         self.scripted = ScriptedForces(cfg.scripted, tuple(arm.side for arm in spec.arms), num_envs, dt)
         self.hand_force_w = torch.zeros(num_envs, hands, 3)
         """(N, H, 3) force at each hand in the last step, world frame [N]."""
+        self.hand_push_w = torch.zeros_like(self.hand_force_w)
+        """(N, H, 3) what of that is a push."""
 
     @property
     def parts(self) -> dict[str, Any]:
@@ -124,7 +126,8 @@ class ExternalForces:
         """Pushes on hands count as forces on hands; all others act at centres of mass."""
         force_w, place, hands = self.pushes.current(), self.pushes.place, self.hand_force_w.shape[1]
         on_hand = torch.nn.functional.one_hot(place, len(self._place_bodies))[:, 1 : 1 + hands]
-        self.hand_force_w = self.hand_force_w + on_hand.unsqueeze(2) * force_w.unsqueeze(1)
+        self.hand_push_w = on_hand.unsqueeze(2) * force_w.unsqueeze(1)
+        self.hand_force_w = self.hand_force_w + self.hand_push_w
         rows = torch.arange(len(place), device=place.device)
         elsewhere = ~on_hand.any(1, keepdim=True) * force_w
         xfrc[rows, self._place_bodies[place], :3] += elsewhere.to(xfrc)

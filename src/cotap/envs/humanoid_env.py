@@ -68,7 +68,9 @@ class HumanoidEnv(VecEnv):
         self._envs_in_all = cfg.num_envs * require_positive_int("processes", processes)
         self.num_envs = cfg.num_envs
         self.spec = spec = ROBOTS[cfg.robot]()
-        self.num_actions, self.num_lower = len(spec.joints), len(spec.lower_joints)
+        modulated = cfg.upper_body.modulation.targets([arm.side for arm in spec.arms])
+        self.num_lower, self._num_joints = len(spec.lower_joints), len(spec.joints)
+        self.num_actions = self._num_joints + len(modulated)
         self.action_slices = {"lower": slice(0, self.num_lower), "upper": slice(self.num_lower, self.num_actions)}
         needed = BYTES_PER_JOINT * len(spec.joints) * cfg.num_envs
         require_memory(f"num_envs {quoted(cfg.num_envs)}", needed, simulated_on(cfg.backend))
@@ -96,7 +98,7 @@ class HumanoidEnv(VecEnv):
         self.randomizer = Randomizer(cfg.randomization, spec, self.sim)
         self.upper_body = UpperBody(cfg.upper_body, spec, n, dt)
         self.actuation = Actuation(spec, self.sim, self.randomizer, self.upper_body, limit)
-        self.observer = Observer(cfg.observations, spec, n)
+        self.observer = Observer(cfg.observations, spec, n, cfg.upper_body.modulation)
         self.recorder = Recorder(spec, self.reader, n, dt, cfg.gait.period_s)
         self._groups = tuple(RewardGroup(g, getattr(cfg.rewards, g), dt) for g in self.reward_groups)
         self._assist = AssistWrench(cfg.assist, spec, torch.as_tensor(torso_inertia(spec, model)), dt)
@@ -107,7 +109,7 @@ class HumanoidEnv(VecEnv):
         """Whether `final_observation` (N, O) and `diverged` (N,) are kept of envs that end, as Gymnasium asks for."""
         self.diverged = torch.zeros(n, dtype=torch.bool)
         self.episode_length_buf = torch.zeros(n, dtype=torch.long)
-        self.torque = torch.zeros(n, self.num_actions)
+        self.torque = torch.zeros(n, self._num_joints)
         """(N, J) joint torques at the end of the last step [Nm]; zero in envs that have just restarted."""
         self.randomizer.randomize_bodies(self.rng)
         self.state: RobotState
@@ -131,7 +133,8 @@ class HumanoidEnv(VecEnv):
     def layout(self) -> dict[str, Any]:
         """What a policy must agree with: robot, joints, observation terms, action convention. Plain data."""
         own = {"robot": self.spec.name, "joints": self.spec.joint_names, "control_dt": self.cfg.control_dt}
-        return json.loads(json.dumps(own | self.observer.layout() | {"actions": vars(self.cfg.actions)}))
+        laws = self.cfg.upper_body.modulation.layout([arm.side for arm in self.spec.arms])
+        return json.loads(json.dumps(own | self.observer.layout() | {"actions": vars(self.cfg.actions)} | laws))
 
     def reset(self, start: tuple[torch.Tensor, torch.Tensor] | None = None) -> TensorDict:
         """Restart every env, from `qpos` (N, 7 + J) and `qvel` (N, 6 + J) if given; return the observations."""
@@ -156,7 +159,7 @@ class HumanoidEnv(VecEnv):
         """Advance by one control step.
 
         Args:
-            actions: (N, J).
+            actions: (N, J), joint by joint; with learned modulation (N, J + M), what is asked of the laws behind.
 
         Returns:
             Observations, rewards (N,), dones (N,), extras with `time_outs` (N,), `falls` (N,), `group_rewards`
@@ -167,7 +170,7 @@ class HumanoidEnv(VecEnv):
         """
         require_shape("actions", actions, (self.num_envs, self.num_actions))
         require_all_finite("actions", actions)
-        action = actions.clamp(-self.cfg.actions.clip, self.cfg.actions.clip)
+        action = self._clipped(actions)
         velocity_before = self.state.joint_vel
         self._act(action)
         self.sim.step(self.actuation.drive)
@@ -184,6 +187,7 @@ class HumanoidEnv(VecEnv):
         self.record = self.recorder.record(
             self.state, self.commands.current(), self.motions.current(), action, self.observer.last_action,
             (self.state.joint_vel - velocity_before) / self.dt, self.torque, self.actuation.current, fell,
+            self.hand_force_w, self.forces.hand_push_w,
         )  # fmt: skip
         self.num_diverged += int(bad.sum())
         rewards, log = self._reward(bad, time_out)
@@ -196,11 +200,22 @@ class HumanoidEnv(VecEnv):
         extras = {"time_outs": time_out, "falls": fell, "group_rewards": rewards, "log": log}
         return self._observe(done), rewards.sum(1), done, extras
 
+    def _clipped(self, actions: torch.Tensor) -> torch.Tensor:
+        """What of actions (N, J + M) counts."""
+        clipped = actions.clamp(-self.cfg.actions.clip, self.cfg.actions.clip)
+        if self.num_actions == self._num_joints:
+            return clipped
+        joints, laws = clipped.tensor_split((self._num_joints,), 1)
+        return torch.cat((joints, self.upper_body.modulation.bounded(laws)), 1)
+
     def _act(self, action: torch.Tensor) -> None:
         """Send targets and set forces. The reference moves first: arms are sent where it will be at the step's end."""
         self.motions.step(self.rng)
         reference = self.motions.current()
-        self.actuation.send(self.state, self.joint_targets(action, reference.position), reference.velocity)
+        joints, laws = action.tensor_split((self._num_joints,), 1)
+        if (modulation := self.upper_body.modulation).active:
+            modulation.approach(self.upper_body.parameters, modulation.wanted(laws))
+        self.actuation.send(self.state, self.joint_targets(joints, reference.position), reference.velocity)
         xfrc = self.sim.xfrc
         self.forces.apply(xfrc, self.state, self.dt * self.episode_length_buf, self.samples)
         if share := self.cfg.assist.share(self.samples):

@@ -61,8 +61,10 @@ GOALS_PER_ARM = 5
 """Logarithms of stiffness along x, y and z and of null-space stiffness, and alpha."""
 
 
-def actor_terms(num_joints: int, num_upper: int, arm_torque: bool = True, num_goals: int = 0) -> tuple[Term, ...]:
-    """Terms of one step of the actor's observation, in order."""
+def actor_terms(
+    num_joints: int, num_upper: int, arm_torque: bool = True, num_goals: int = 0, laws: tuple[Term, ...] = ()
+) -> tuple[Term, ...]:
+    """Terms of one step of the actor's observation, in order; `laws` are those of learned modulation."""
     terms: list[Term] = [
         ("torso_angular_velocity", 3, 0.25),
         ("projected_gravity", 3, 1.0),
@@ -81,7 +83,7 @@ def actor_terms(num_joints: int, num_upper: int, arm_torque: bool = True, num_go
         terms.append(("arm_torque", num_upper, 1.0))
     if num_goals:
         terms.append(("goals", num_goals, 1.0))
-    return tuple(terms)
+    return (*terms, *laws)
 
 
 def critic_terms(num_hands: int, num_torques: int = 0) -> tuple[Term, ...]:

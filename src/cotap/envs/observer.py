@@ -8,6 +8,7 @@ import torch
 
 from cotap.compliance.interface import LawParameters
 from cotap.envs.commands import Command
+from cotap.envs.modulation import ModulationConfig, observed_laws
 from cotap.envs.observations import (
     GOALS_PER_ARM,
     ObservationConfig,
@@ -18,9 +19,9 @@ from cotap.envs.observations import (
     noise_amplitude,
 )
 from cotap.envs.state import RobotState
-from cotap.envs.symmetry import actor_reflection, critic_reflection, joint_reflection
+from cotap.envs.symmetry import actor_reflection, critic_reflection, joint_reflection, law_reflection
 from cotap.persistence import Stateful, uniform
-from cotap.reflection import Symmetry
+from cotap.reflection import Symmetry, join
 from cotap.robots import RobotSpec
 from cotap.rotations import quat_from_matrix
 
@@ -33,24 +34,32 @@ class Observer(Stateful):
         cfg: What is observed.
         spec: The robot.
         num_envs: Number of envs.
+        modulation: What of the arms' laws is set by actions, and so is observed.
     """
 
     STATE = ("last_action",)
 
-    def __init__(self, cfg: ObservationConfig, spec: RobotSpec, num_envs: int) -> None:
+    def __init__(
+        self, cfg: ObservationConfig, spec: RobotSpec, num_envs: int, modulation: ModulationConfig | None = None
+    ) -> None:
         cfg.check()
         self.cfg = cfg
-        joints, arms, self._upper = len(spec.joints), len(spec.arms), len(spec.upper_joints)
+        self._joints, arms, self._upper = len(spec.joints), len(spec.arms), len(spec.upper_joints)
+        modulation = modulation or ModulationConfig()
+        laws = modulation.terms(arms)
+        self._shows_laws = bool(laws)
         self._default = torch.tensor([j.default_rad for j in spec.joints])
         seen = cfg.arm_torque == "actor"
-        terms = actor_terms(joints, self._upper, seen, GOALS_PER_ARM * arms * cfg.goals)
+        terms = actor_terms(self._joints, self._upper, seen, GOALS_PER_ARM * arms * cfg.goals, laws)
         self._critic_terms = critic_terms(arms, 0 if seen else self._upper)
         self._critic_scale = torch.cat([torch.full((width,), scale) for _, width, scale in self._critic_terms])
         self.history = ObservationHistory(terms, num_envs, cfg.history)
         self._noise = noise_amplitude(terms, cfg.noise)
         self._clean = ObservationHistory(terms, num_envs, cfg.history) if "clean" in self.groups["critic"] else None
-        self.last_action = torch.zeros(num_envs, joints)
-        """(N, J) what was done in the last step."""
+        sides = [arm.side for arm in spec.arms]
+        self._of_laws = len(modulation.targets(sides))
+        self.last_action = torch.zeros(num_envs, self._joints + self._of_laws)
+        """(N, J + M) what was done in the last step."""
 
     @property
     def groups(self) -> dict[str, list[str]]:
@@ -67,7 +76,8 @@ class Observer(Stateful):
         terms, steps = self.history.terms, self.history.steps
         full, critic = actor_reflection(spec, terms, steps), critic_reflection(spec, self._critic_terms)
         groups = {"policy": full, "clean": full, "present": actor_reflection(spec, terms, 1), "privileged": critic}
-        return Symmetry(groups, joint_reflection(spec, spec.joint_names))
+        actions = join([joint_reflection(spec, spec.joint_names), law_reflection(spec, self._of_laws)])
+        return Symmetry(groups, actions)
 
     def reset(self, mask: torch.Tensor) -> None:
         """Nothing was done yet in the envs of `mask` (N,)."""
@@ -113,7 +123,10 @@ class Observer(Stateful):
     def _present(
         self, s: RobotState, command: Command, arm_reference: torch.Tensor, torque: torch.Tensor, goals: LawParameters
     ) -> torch.Tensor:
-        values = actor_values(s, command, arm_reference, self._default, self.last_action, torque[:, -self._upper :])
+        done = self.last_action[:, : self._joints]
+        values = actor_values(s, command, arm_reference, self._default, done, torque[:, -self._upper :])
+        if self._shows_laws:
+            values |= observed_laws(goals)
         if self.cfg.goals:
             stiffness, null = (goals.stiffness / 300.0).log(), (goals.null_stiffness / 40.0).log()
             values["goals"] = torch.cat((stiffness, null.unsqueeze(2), goals.alpha.unsqueeze(2)), 2).flatten(1)

@@ -7,7 +7,8 @@ import torch
 from cotap.compliance.kinematics import ChainPose
 from cotap.envs.commands import Command
 from cotap.envs.gait_phase import desired_contact, swing_progress
-from cotap.envs.rewards import RobotScales, StepRecord
+from cotap.envs.rewards import StepRecord
+from cotap.envs.scales import RobotScales
 from cotap.envs.state import RobotState, StateReader
 from cotap.motions.generator import ArmReference
 from cotap.persistence import Stateful
@@ -45,7 +46,7 @@ class Recorder(Stateful):
     def record(
         self, s: RobotState, command: Command, reference: ArmReference, action: torch.Tensor,
         last_action: torch.Tensor, acceleration: torch.Tensor, torque: torch.Tensor, target: torch.Tensor,
-        fell: torch.Tensor,
+        fell: torch.Tensor, hand_force_w: torch.Tensor, hand_push_w: torch.Tensor,
     ) -> StepRecord:  # fmt: skip
         """The record of a step, once. Arguments are as its fields; `target` (N, J) are all joints' [rad]."""
         wanted = self._reader.arm_chains.pose(reference.position.unflatten(1, (self._num_arms, -1)))
@@ -68,6 +69,8 @@ class Recorder(Stateful):
             key_velocities_reference_t=ref_velocities,
             mean_error=self._average_error(s, command),
             fell=fell,
+            hand_force_w=hand_force_w,
+            hand_push_w=hand_push_w,
             scales=self._scales,
         )
 

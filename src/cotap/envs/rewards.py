@@ -5,7 +5,6 @@ Terms are rates: the environment multiplies them by the control step, except `fa
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Annotated, Any, TypeVar, cast
@@ -16,52 +15,11 @@ import tyro
 # Terms stand in the classes of their weights, and are functions of a step's record, no methods.
 # pyright: reportGeneralTypeIssues=false
 from cotap.checks import require_finite
-from cotap.compliance.dynamics import GRAVITY_M_S2
 from cotap.envs.commands import Command
+from cotap.envs.scales import RobotScales
 from cotap.envs.state import RobotState
 from cotap.motions.generator import ArmReference
-from cotap.robots import RobotSpec
 from cotap.rotations import rotate
-
-
-@dataclass(frozen=True)
-class RobotScales:
-    """What rewards must know of a robot, so that they fit any. J joints of which L lower, U upper."""
-
-    joint_low: torch.Tensor
-    """(J,) soft lower limits [rad]."""
-    joint_high: torch.Tensor
-    """(J,) soft upper limits [rad]."""
-    default_position: torch.Tensor
-    """(J,) [rad]."""
-    num_lower: int
-    """L; the first L joints are the lower agent's."""
-    hip_waist: tuple[int, ...]
-    """Lower joints that straight walking does not need: those that do not pitch, ankles aside."""
-    foot_clearance_m: float
-    """Least height of the sole at mid-swing that is asked for: 0.07 of the torso's nominal height."""
-    foot_distance_m: float
-    """Sideways distance of the soles below which feet are too close: 0.45 of that in the default pose."""
-    torso_ahead_m: float
-    """How far ahead of the middle of the soles the torso's origin is when the robot stands in its default pose."""
-    falling_time_s: float
-    """Time constant of an inverted pendulum of nine tenths of the torso's nominal height."""
-
-    @classmethod
-    def of(cls, spec: RobotSpec) -> RobotScales:
-        """The scales of a robot. Soft limits leave a twentieth of each joint's range."""
-        joints, num_lower = spec.joints, len(spec.lower_joints)
-        low, high = torch.tensor([j.range_rad for j in joints]).unbind(1)
-        center, half = (low + high) / 2, 0.95 * (high - low) / 2
-        ankles = {body.joint for foot in spec.feet for body in spec.bodies if body.name == foot.body}
-        hip_waist = (i for i, j in enumerate(joints[:num_lower]) if j.name not in ankles and not spec.pitches(j.name))
-        default = torch.tensor([j.default_rad for j in joints])
-        clearance, distance = 0.07 * spec.nominal_height_m, 0.45 * spec.sole_distance_m
-        low, high = center - half, center + half
-        falling_time = math.sqrt(0.9 * spec.nominal_height_m / GRAVITY_M_S2)
-        return cls(
-            low, high, default, num_lower, tuple(hip_waist), clearance, distance, spec.torso_ahead_m, falling_time
-        )
 
 
 @dataclass(frozen=True)
@@ -72,9 +30,9 @@ class StepRecord:
     command: Command
     reference: ArmReference
     action: torch.Tensor
-    """(N, J) this step's action."""
+    """(N, J) this step's action; with learned modulation (N, J + M), what is asked of the laws behind."""
     last_action: torch.Tensor
-    """(N, J) the action before it."""
+    """The action before it."""
     joint_acceleration: torch.Tensor
     """(N, J) mean over the step [rad/s^2]."""
     torque: torch.Tensor
@@ -97,7 +55,26 @@ class StepRecord:
     """(N, 3) horizontal velocity [m/s] and yaw rate [rad/s] minus their commands, averaged over about half a stride."""
     fell: torch.Tensor
     """(N,) bool: the episode ends in a fall."""
+    hand_force_w: torch.Tensor
+    """(N, H, 3) force on each hand during the step, world frame [N]."""
+    hand_push_w: torch.Tensor
+    """(N, H, 3) what of that is a push."""
     scales: RobotScales
+
+    @property
+    def free_hands(self) -> torch.Tensor:
+        """(N, H) bool: no force acts on the hand."""
+        return ~self.hand_force_w.any(2)
+
+    @property
+    def loaded_hands(self) -> torch.Tensor:
+        """(N, H) bool: a load acts on the hand, and no push."""
+        return self.hand_force_w.any(2) & ~self.hand_push_w.any(2)
+
+    @property
+    def pushed_hands(self) -> torch.Tensor:
+        """(N, H) bool: a push acts on the hand, and no load."""
+        return self.hand_push_w.any(2) & (self.hand_force_w == self.hand_push_w).all(2)
 
 
 TermFunction = Callable[[StepRecord], torch.Tensor]
@@ -152,6 +129,11 @@ def _lower(s: StepRecord) -> slice:
 
 def _upper(s: StepRecord) -> slice:
     return slice(s.scales.num_lower, None)
+
+
+def _hand_offset(s: StepRecord) -> torch.Tensor:
+    """Hands (N, H, 3) relative to their reference, which the torso carries, torso frame [m]."""
+    return (s.key_points_t - s.key_points_reference_t)[:, : s.hand_push_w.shape[1]]
 
 
 def swing_clearance(swing: torch.Tensor, peak_m: float) -> torch.Tensor:
@@ -348,6 +330,25 @@ class UpperRewards:
     def reference_closeness(s: StepRecord) -> torch.Tensor:
         """Closeness of the arms' joint targets to their reference (paper, section III-D); for distillation."""
         return torch.exp(-2.0 * (s.arm_target - s.reference.position).norm(dim=1))
+
+    @term(0.0)
+    def free_hand_error(s: StepRecord) -> torch.Tensor:
+        """Distance from the reference of hands that are free, mean over all hands [m]; for learned modulation."""
+        return (_hand_offset(s).norm(dim=2) * s.free_hands).mean(1)
+
+    @term(0.0)
+    def loaded_hand_error(s: StepRecord) -> torch.Tensor:
+        """The same of hands under a load, and no push [m]."""
+        return (_hand_offset(s).norm(dim=2) * s.loaded_hands).mean(1)
+
+    @term(0.0)
+    def push_resistance(s: StepRecord) -> torch.Tensor:
+        """What hands under a push, and no load, resist it with: its force beyond that of a spring of 150 N/m, mean over
+        all hands [N]."""
+        push_t = s.hand_push_w @ s.state.torso_rotation_w
+        force = push_t.norm(dim=2)
+        given_way = (_hand_offset(s) * push_t).sum(2) / force.clamp_min(1e-6)
+        return ((force - 150.0 * given_way).clamp_min(0.0) * s.pushed_hands).mean(1)
 
     @term(-2e-5)
     def upper_torque(s: StepRecord) -> torch.Tensor:

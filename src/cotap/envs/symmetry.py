@@ -39,10 +39,15 @@ def _term_reflection(spec: RobotSpec, name: str, width: int) -> Reflection:
         return joint_reflection(spec, spec.joint_names)
     if name in ("reference_arm_position", "arm_torque"):
         return joint_reflection(spec, spec.upper_joints)
-    if name == "goals":  # diagonal stiffness is its own mirror image; arms change places
-        arms = torch.arange(width).unflatten(0, (len(spec.arms), -1))
-        return Reflection(arms[_swapped_arms(spec)].flatten(), torch.ones(width))
+    if name in ("goals", "law_alpha", "law_log_stiffness"):
+        return law_reflection(spec, width)
     return Reflection(torch.arange(width), torch.tensor(_SIGNS[name]))
+
+
+def law_reflection(spec: RobotSpec, width: int) -> Reflection:
+    """Reflection of laws' parameters, arm by arm: diagonal stiffness is its own mirror image; arms change places."""
+    arms = torch.arange(width).reshape(len(spec.arms), width // len(spec.arms))
+    return Reflection(arms[_swapped_arms(spec)].flatten(), torch.ones(width))
 
 
 def _swapped_arms(spec: RobotSpec) -> torch.Tensor:

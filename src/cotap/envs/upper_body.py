@@ -13,6 +13,7 @@ from cotap.compliance.interface import ArmState, LawParameters, Remembering, Tor
 from cotap.compliance.laws import LAWS, LawConfig
 from cotap.compliance.torso import chain_compliance, hand_base_compliance, torso_compliance
 from cotap.envs.hand_sensing import HandSensors
+from cotap.envs.modulation import Modulation, ModulationConfig
 from cotap.envs.state import RobotState
 from cotap.persistence import Stateful, restored, uniform
 from cotap.robots import RobotSpec
@@ -76,6 +77,7 @@ class UpperBodyConfig:
     right: LawConfig = field(default_factory=LawConfig)
     torso: TorsoComplianceConfig = field(default_factory=TorsoComplianceConfig)
     sampling: LawSampling = field(default_factory=LawSampling)
+    modulation: ModulationConfig = field(default_factory=ModulationConfig)
     singularity_ratio: bool = True
     """Whether compliance gives way to PD near singular arms (paper, equation 9); False for its ablation."""
 
@@ -85,6 +87,7 @@ class UpperBodyConfig:
         self.right.check("upper_body.right")
         self.torso.check()
         self.sampling.check()
+        self.modulation.check({"left": self.left, "right": self.right}, self.sampling.enabled)
 
     def of(self, side: str) -> LawConfig:
         """The law of the arm on `side`."""
@@ -124,6 +127,7 @@ class UpperBody(Stateful):
             torch.tensor([c.null_stiffness for c in configs], dtype=dtype).repeat(n, 1),
             torch.tensor([c.alpha for c in configs], dtype=dtype).repeat(n, 1),
         )
+        self.modulation = Modulation(cfg.modulation, configs, dt, dtype)
         self.fresh = torch.ones(n, dtype=torch.bool)
         # Two torque laws, the one in force and the one before it: (2, N, A, n[, n]).
         self._anchor, self._feedforward, self._elastic = (torch.zeros(2, n, a, j, dtype=dtype) for _ in range(3))
@@ -167,9 +171,10 @@ class UpperBody(Stateful):
         return self._stiffness[1]
 
     def reset(self, mask: torch.Tensor, rng: torch.Generator) -> None:
-        """The next command of the envs in `mask` has none before it; their parameters are drawn anew."""
+        """The next command of the envs in `mask` has none before it; their parameters begin anew."""
         self.fresh = self.fresh | mask
         self.sensors.reset(mask)
+        self.modulation.reset(self.parameters, mask)
         if self._cfg.sampling.enabled:
             self._sample(mask, rng)
 

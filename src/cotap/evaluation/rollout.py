@@ -118,13 +118,14 @@ def picture_row(env: HumanoidEnv) -> torch.Tensor:
 
 
 def reference_actions(env: HumanoidEnv) -> torch.Tensor:
-    """Upper actions (N, U) that send the arms to their raw reference; absolute ones to where it is now, which is one
-    step late."""
-    upper, targets = env.action_slices["upper"], env.joint_targets
+    """Upper actions (N, U + M) that send the arms to their raw reference, under the laws as they are configured;
+    absolute ones to where it is now, which is one step late."""
+    upper, targets = slice(env.num_lower, None), env.joint_targets
     reference = env.motions.current().position
+    laws = reference.new_zeros(len(reference), env.upper_body.modulation.size)
     if env.cfg.actions.upper_mode == "residual":
-        return torch.zeros_like(reference)
-    return (reference - targets.default[upper]) / targets.scale[upper]
+        return torch.cat((torch.zeros_like(reference), laws), 1)
+    return torch.cat(((reference - targets.default[upper]) / targets.scale[upper], laws), 1)
 
 
 def acting(env: HumanoidEnv, policy: PolicyFunction, upper_actions: str) -> PolicyFunction:
@@ -153,7 +154,7 @@ def arm_static_torque(arms: Arms, s: RobotState, force_w: torch.Tensor) -> torch
 
 def trajectory_row(env: HumanoidEnv, fell: torch.Tensor) -> dict[str, torch.Tensor]:
     """One step's row (N, ...) of a `Trajectory`, just after `env.step`; `fell` (N,) from its extras."""
-    r, upper = env.record, env.action_slices["upper"]
+    r, upper = env.record, slice(env.num_lower, None)
     s, hands = r.state, len(env.spec.arms)
     offset_t = (r.key_points_t - r.key_points_reference_t)[:, :hands]
     return {

@@ -184,7 +184,7 @@ def settle(env: HumanoidEnv, policy: PolicyFunction, seconds: float, side: int) 
             rotation = s.heading_w.transpose(1, 2) @ s.torso_rotation_w
             condition = condition_number(env.reader.arm_chains.jacobian(s.arms)[:, side])
     moved = (rotation @ (averages[1] - averages[0]).unsqueeze(-1)).squeeze(-1)
-    torque = env.record.torque[:, env.action_slices["upper"]].unflatten(1, (len(env.spec.arms), -1))[:, side]
+    torque = env.record.torque[:, env.num_lower :].unflatten(1, (len(env.spec.arms), -1))[:, side]
     saturated = (torque.abs() > 0.999 * env.arm_limits[side]).any(1)
     return Settled(moved.cpu(), condition.cpu(), fell.cpu(), saturated.cpu(), torch.stack(frames).cpu())
 

@@ -129,12 +129,12 @@ class Tour(Protocol):
         drawn = self.draw(env.spec, self.stance, range(env.num_envs))
         self._waypoints, self._targets = (part.to(env.device) for part in drawn)
         if not env.upper_body.active:
-            env.randomizer.set_nominal_gains(env.action_slices["upper"], self.stance.arm_kp, self.stance.arm_kd)
+            env.randomizer.set_nominal_gains(slice(env.num_lower, None), self.stance.arm_kp, self.stance.arm_kd)
 
     def evaluate(self, env: HumanoidEnv, policy: PolicyFunction) -> dict[str, Any]:
         """Run in an environment that is prepared. Returns the measured part of the JSON."""
         obs, act = self._begin(env), acting(env, policy, self.upper_actions)
-        scorer = self.scorer(env.num_envs, env.num_actions, env.device)
+        scorer = self.scorer(env.num_envs, len(env.spec.joints), env.device)
         film: list[torch.Tensor] = []
         steps = range(self.waypoints * self.segment_steps)
         for step in tqdm(steps, desc="tour", unit="step", disable=None, leave=False):
@@ -200,7 +200,7 @@ class Tour(Protocol):
         from cotap.evaluation.tour.film import TourMarks
 
         waypoints, _ = self.draw(env.spec, self.stance, range(1))
-        punches = Punches(env.cfg.forces.punches, env.num_actions, 1, env.dt)
+        punches = Punches(env.cfg.forces.punches, len(env.spec.joints), 1, env.dt)
         marks = TourMarks(env.spec, waypoints[0], self.segment_s, punches, STRIDE * env.dt)
         film_video(path, env, self.film, sheet, marks)
 
