@@ -48,7 +48,8 @@ class DeployOptions:
     library: str = ""
     """Motion library (.npz) of the clip. By default the shipped one."""
     left: str = ""
-    """Law of the left arm, such as cotap:alpha=0.7,stiffness=500. By default the scenario's, or the training's."""
+    """Law of the left arm, such as cotap:alpha=0.7,stiffness=500. By default the scenario's, or the training's. A
+    policy that sets alpha and stiffness itself no longer does."""
     right: str = ""
     """Law of the right arm."""
     passive: bool = False
@@ -112,6 +113,7 @@ def deploy(options: DeployOptions) -> dict[str, Any]:
         text = getattr(options, side) or getattr(scenario, side)
         if text:
             setattr(laws, side, parse_law(side, text, replace(laws.of(side))))
+            laws.modulation.hold()
     if options.passive:
         make_passive(laws)
     laws.check()

@@ -12,11 +12,14 @@ import torch
 from cotap.agents.actors import DualActorCritic
 from cotap.agents.checkpoint import save_checkpoint
 from cotap.agents.runner import layout_of
+from cotap.compliance.laws import LawConfig
 from cotap.configs import BaseTraining, to_plain
 from cotap.deployment.graph import export_policy
 from cotap.deployment.policy import OnnxPolicy
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.actions import ActionConfig
+from cotap.envs.modulation import ModulationConfig
+from cotap.envs.upper_body import UpperBodyConfig
 from cotap.evaluation.policy import shipped_checkpoint
 
 
@@ -42,6 +45,13 @@ def save_random_policy(path: Path, robot: str = "h1", output_gain: float = 0.01,
     save_checkpoint(path, content)
 
 
+def modulated_laws(kind: str) -> UpperBodyConfig:
+    """Arms whose laws the policy sets, one of them through an energy store."""
+    left = LawConfig("cotap", (400.0, 300.0, 200.0), alpha=0.4, passive=True)
+    right = LawConfig("cotap", alpha=0.6, error="task")
+    return UpperBodyConfig(left, right, modulation=ModulationConfig(kind))
+
+
 @pytest.fixture
 def save_policy() -> Callable[..., None]:
     return save_random_policy
@@ -52,11 +62,16 @@ def random_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Callable[...,
     """The checkpoint of a policy with random weights, made once per kind."""
     folder, made = tmp_path_factory.mktemp("checkpoints"), {}
 
-    def make(robot: str = "h1", upper_mode: str = "residual", output_gain: float = 0.01) -> Path:
-        kind = f"{robot}-{upper_mode}-{output_gain}"
+    def make(
+        robot: str = "h1", upper_mode: str = "residual", output_gain: float = 0.01, modulation: str = "none"
+    ) -> Path:
+        kind = f"{robot}-{upper_mode}-{output_gain}-{modulation}"
         if kind not in made:
             made[kind] = folder / f"{kind}.pt"
-            save_random_policy(made[kind], robot, output_gain, actions=ActionConfig(upper_mode=upper_mode))
+            fields: dict[str, Any] = {"actions": ActionConfig(upper_mode=upper_mode)}
+            if modulation != "none":
+                fields["upper_body"] = modulated_laws(modulation)
+            save_random_policy(made[kind], robot, output_gain, **fields)
         return made[kind]
 
     return make

@@ -74,17 +74,36 @@ class Watched(OnnxPolicy):
 KINDS = [(robot, mode, "pd") for robot in ("h1", "made-up") for mode in ("residual", "absolute")]
 KINDS += [("h1", "residual", "cotap"), ("h1", "absolute", "cotap"), ("h1", "residual", "mixed")]
 KINDS += [("g1", "absolute", "pd"), ("g1", "residual", "cotap")]
+MODULATED = [("h1", "stiffness"), ("g1", "alpha"), ("made-up", "stiffness")]
 
 
 @pytest.mark.parametrize(("name", "mode", "law"), KINDS)
 def test_the_loop_is_the_environment(name, mode, law, random_checkpoint, random_policy):
     kind: dict[str, Any] = {"robot": name, "upper_mode": mode, "output_gain": 0.3}
-    laws, in_torch = laws_named(law), load_policy(random_checkpoint(**kind))
-    env = held_env(random_checkpoint(**kind), laws)
+    side_by_side(random_checkpoint(**kind), random_policy(**kind), laws_named(law))
+
+
+@pytest.mark.parametrize(("name", "modulation"), MODULATED)
+def test_the_loop_is_the_environment_where_the_policy_sets_the_laws(name, modulation, random_checkpoint, random_policy):
+    kind: dict[str, Any] = {"robot": name, "output_gain": 1.0, "modulation": modulation}
+    laws = load_policy(random_checkpoint(**kind)).env_config.upper_body
+    env, controller = side_by_side(random_checkpoint(**kind), random_policy(**kind), laws)
+    here, there = env.upper_body.parameters, controller.upper_body.parameters
+    torch.testing.assert_close(here.alpha.double(), there.alpha, atol=1e-5, rtol=0.0)
+    torch.testing.assert_close(here.stiffness.double(), there.stiffness, atol=0.0, rtol=1e-5)
+    began = torch.tensor([[0.4, 0.6]])
+    assert float((here.alpha - began).abs().max()) > 0.02  # the policy set something
+    assert (modulation == "stiffness") == (float((here.stiffness[0, 1] / 300.0).log().abs().max()) > 0.02)
+
+
+def side_by_side(checkpoint, exported, laws: UpperBodyConfig) -> tuple[HumanoidEnv, Controller]:
+    """Run both for a while, and compare what they observe, send and become at every step."""
+    in_torch = load_policy(checkpoint)
+    env = held_env(checkpoint, laws)
     nominal, start = env.spec.nominal_height_m, env.state.joint_pos
     command(env.commands, True, nominal)
     obs = env.reset()
-    policy = Watched(random_policy(**kind))
+    policy = Watched(exported)
     robot, controller = beside_it(env, policy, laws)
     moved = 0.0
     for k in range(round(SECONDS / env.dt)):
@@ -103,3 +122,4 @@ def test_the_loop_is_the_environment(name, mode, law, random_checkpoint, random_
         moved = max(moved, float((env.state.joint_pos - start).abs().max()))
     assert env.commands.current().stand.all()  # walked, and came to rest
     assert moved > 0.1  # the policy did something
+    return env, controller

@@ -18,6 +18,7 @@ from cotap.deployment.metadata import PolicyError, PolicyMetadata
 from cotap.deployment.policy import OnnxPolicy
 from cotap.envs.commands import CommandConfig, CommandSource
 from cotap.envs.gait_phase import GaitConfig
+from cotap.envs.modulation import observed_laws
 from cotap.envs.observations import ObservationHistory, Term, actor_terms, actor_values
 from cotap.envs.state import RobotState
 from cotap.envs.terminations import TerminationConfig
@@ -56,6 +57,7 @@ def robot_of(metadata: PolicyMetadata) -> RobotSpec:
         "kd": [j.kd for j in spec.joints],
         "nominal_height_m": spec.nominal_height_m,
         "observation terms": [list(t) for t in observed_terms(metadata, spec)],
+        "law_targets": law_config(metadata).modulation.targets([arm.side for arm in spec.arms]),
     }
     for name, value in own.items():
         found = metadata.observation["terms"] if name == "observation terms" else getattr(metadata, name)
@@ -72,9 +74,10 @@ def robot_of(metadata: PolicyMetadata) -> RobotSpec:
 
 
 def observed_terms(metadata: PolicyMetadata, spec: RobotSpec) -> tuple[Term, ...]:
-    """What is observed of `spec`, with the arms' torque if the policy sees it."""
+    """What is observed of `spec`, with the arms' torque if the policy sees it, and with the laws if it sets them."""
     sees_torque = "arm_torque" in (name for name, _, _ in metadata.observation["terms"])
-    return actor_terms(len(spec.joints), len(spec.upper_joints), sees_torque)
+    laws = law_config(metadata).modulation.terms(len(spec.arms))
+    return actor_terms(len(spec.joints), len(spec.upper_joints), sees_torque, laws=laws)
 
 
 def command_config(metadata: PolicyMetadata) -> CommandConfig:
@@ -117,7 +120,7 @@ class ArmMotion(Protocol):
 
 
 class Controller:
-    """The policy's loop: observation history, gait phase, and the arms' law.
+    """The policy's loop: observation history, gait phase, and the arms' law, perhaps as the policy sets it.
 
     All but the networks (onnxruntime) is the environment's own code with one env, laws in float64.
 
@@ -179,17 +182,19 @@ class Controller:
         if self._started:
             self.commands.step(self._rng)
         observed = self.motion.current().position
-        values = actor_values(
+        values = observed_laws(self.upper_body.parameters) | actor_values(
             readings.state, self.commands.current(), observed, self._default, torch.from_numpy(self._action)[None],
             torch.from_numpy(readings.torque[self._num_lower :])[None],
         )  # fmt: skip
         present = self._history.scaled(values).float()
         fresh = torch.full((1,), not self._started)
         self._started = True
-        targets = self._policy(self._history.append(present, fresh)[0].numpy())
+        found = self._policy(self._history.append(present, fresh)[0].numpy())
+        targets, wanted = np.split(found, [len(self._action)])
         seen = observed[0].double().numpy()
         if self._raw_arms:
             targets[self._num_lower :] = seen
+        self._modulate(torch.from_numpy(wanted)[None])
         self._action = self._policy.action(targets, seen)
         self.motion.step(self._rng)
         reference = self.motion.current()
@@ -202,6 +207,14 @@ class Controller:
         arms = torch.from_numpy(targets[self._num_lower :])[None]
         self.upper_body.send(readings.state, arms, reference.velocity.double())
         return law.with_arms(self.upper_body.newest, self._num_lower)
+
+    def _modulate(self, wanted: torch.Tensor) -> None:
+        """Move the laws towards what the policy asks for (1, M), or holds with the raw reference."""
+        modulation = self.upper_body.modulation
+        if modulation.active:
+            if self._raw_arms:
+                wanted = modulation.wanted(torch.zeros_like(wanted))
+            modulation.approach(self.upper_body.parameters, wanted)
 
 
 def measured(truth: RobotState, **readings: Any) -> RobotState:

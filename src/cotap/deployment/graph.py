@@ -1,4 +1,4 @@
-"""From a checkpoint to one ONNX file: observation in, joint targets out."""
+"""From a checkpoint to one ONNX file: observation in, joint targets out, and perhaps what the arms' laws are asked."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ from cotap import __version__
 from cotap.agents.actors import DualActorCritic
 from cotap.agents.checkpoint import require_layout, sha256
 from cotap.configs import to_plain
-from cotap.deployment.metadata import FORMAT, INPUT, TARGETS, PolicyMetadata
+from cotap.deployment.metadata import FORMAT, INPUT, LAW_TARGETS, TARGETS, PolicyMetadata
 from cotap.deployment.policy import OnnxPolicy
 from cotap.deployment.terms import about_terms, golden_moment
 from cotap.envs import HumanoidEnvConfig
 from cotap.envs.actions import JointTargets
+from cotap.envs.modulation import Modulation
 from cotap.envs.observations import Term, actor_terms
 from cotap.evaluation.policy import load_policy
 from cotap.files import write_atomically
@@ -37,18 +38,24 @@ FRAMES = (
 
 
 class TargetGraph(nn.Module):
-    """What is exported: raw observations (N, W) to joint targets (N, J) [rad]. The arms' reference is the newest one
-    observed."""
+    """What is exported: raw observations (N, W) to joint targets (N, J) [rad], and with learned modulation to what is
+    asked of the laws (N, M). The arms' reference is the newest one observed."""
 
-    def __init__(self, model: DualActorCritic, targets: JointTargets, clip: float, reference: slice) -> None:
+    def __init__(
+        self, model: DualActorCritic, targets: JointTargets, modulation: Modulation, clip: float, reference: slice
+    ) -> None:
         super().__init__()
         self.model = model
-        self._targets, self._clip, self._reference = targets, clip, reference
+        self._targets, self._modulation, self._clip, self._reference = targets, modulation, clip, reference
 
-    def forward(self, observation: torch.Tensor) -> torch.Tensor:
-        """Joint targets."""
+    def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """All outputs."""
         action = self.model({"policy": observation}).clamp(-self._clip, self._clip)
-        return self._targets(action, observation[:, self._reference])
+        joints = action.shape[1] - self._modulation.size
+        targets = self._targets(action[:, :joints], observation[:, self._reference])
+        if not self._modulation.size:
+            return (targets,)
+        return targets, self._modulation.wanted(action[:, joints:])
 
 
 def newest(terms: tuple[Term, ...], history: int, wanted: str) -> slice:
@@ -75,15 +82,19 @@ def export_policy(checkpoint: Path | str, output: Path, checks: int = 1000, seed
     cfg = policy.env_config
     spec = ROBOTS[cfg.robot]()
     terms, history = terms_of(cfg, spec), cfg.observations.history
+    sides = [arm.side for arm in spec.arms]
     layout = {"joints": list(spec.joint_names), "terms": [list(t) for t in terms], "history": history}
+    layout |= cfg.upper_body.modulation.layout(sides)
     require_layout(checkpoint, policy.layout, layout)
     targets = JointTargets(cfg.actions, spec)
     reference = newest(terms, history, "reference_arm_position")
-    graph = TargetGraph(policy.model, targets, cfg.actions.clip, reference).eval()
-    readings, observation = golden_moment(spec, terms, history, seed)
+    modulation = Modulation(cfg.upper_body.modulation, [cfg.upper_body.of(side) for side in sides], cfg.control_dt)
+    graph = TargetGraph(policy.model, targets, modulation, cfg.actions.clip, reference).eval()
+    readings, observation = golden_moment(cfg, spec, terms, history, seed)
     with torch.no_grad():
-        golden = {"readings": readings, "observation": observation.tolist(),
-                  "joint_targets": graph(observation.unsqueeze(0))[0].tolist()}  # fmt: skip
+        found = zip((TARGETS, LAW_TARGETS), graph(observation.unsqueeze(0)), strict=False)
+        golden = {"readings": readings, "observation": observation.tolist()}
+        golden |= {name: values[0].tolist() for name, values in found}
     metadata = describe(cfg, spec, targets, policy.stage, sha256(checkpoint), golden)
     worst = 0.0
 
@@ -100,7 +111,8 @@ def export_policy(checkpoint: Path | str, output: Path, checks: int = 1000, seed
 
 def terms_of(cfg: HumanoidEnvConfig, spec: RobotSpec) -> tuple[Term, ...]:
     """Terms of the observation that a robot makes for a policy trained in `cfg`."""
-    return actor_terms(len(spec.joints), len(spec.upper_joints), cfg.observations.arm_torque == "actor")
+    laws = cfg.upper_body.modulation.terms(len(spec.arms))
+    return actor_terms(len(spec.joints), len(spec.upper_joints), cfg.observations.arm_torque == "actor", laws=laws)
 
 
 def describe(
@@ -109,6 +121,7 @@ def describe(
 ) -> PolicyMetadata:  # fmt: skip
     """The metadata of a policy that was trained in the environment `cfg`."""
     joints, terms = spec.joints, terms_of(cfg, spec)
+    modulated = cfg.upper_body.modulation.targets([arm.side for arm in spec.arms])
     return PolicyMetadata(
         format=FORMAT,
         robot=spec.name,
@@ -119,7 +132,7 @@ def describe(
         kd=[j.kd for j in joints],
         torque_limit_nm=[cfg.torque_limit_scale * j.torque_limit_nm for j in joints],
         action={"scale_rad": [round(v, 9) for v in targets.scale.tolist()], "clip": cfg.actions.clip,
-                "upper_mode": cfg.actions.upper_mode},
+                "upper_mode": cfg.actions.upper_mode, **({"law_targets": modulated} if modulated else {})},
         observation={"terms": [list(t) for t in terms], "history": cfg.observations.history,
                      "about": about_terms(cfg, spec, terms), "order": ORDER, "frames": FRAMES},
         control_dt=cfg.control_dt,
@@ -146,9 +159,9 @@ def typical_observations(graph: TargetGraph, count: int, seed: int) -> Iterator[
 
 @torch.no_grad()
 def largest_difference(policy: OnnxPolicy, graph: TargetGraph, count: int, seed: int) -> float:
-    """Largest difference of targets [rad] over so many typical observations; NaN if one is."""
+    """Largest difference of targets [rad, and laws' units] over so many typical observations; NaN if one is."""
     worst = [
-        np.abs(np.stack([policy(row) for row in part.numpy()]) - graph(part).numpy()).max()
+        np.abs(np.stack([policy(row) for row in part.numpy()]) - torch.cat(graph(part), 1).numpy()).max()
         for part in typical_observations(graph, count, seed)
     ]
     return float(np.max(worst))
@@ -169,10 +182,11 @@ def _write_onnx(path: Path, graph: TargetGraph, metadata: PolicyMetadata) -> Non
     import onnx
 
     example = torch.zeros(1, metadata.observation_width)
+    outputs = [TARGETS, LAW_TARGETS] if metadata.law_targets else [TARGETS]
     with warnings.catch_warnings(), _quiet(logging.getLogger("torch.onnx")):
         warnings.simplefilter("ignore")  # torch warns of its own coming changes
         program = torch.onnx.export(
-            graph, (example,), input_names=[INPUT], output_names=[TARGETS], opset_version=OPSET, dynamo=True,
+            graph, (example,), input_names=[INPUT], output_names=outputs, opset_version=OPSET, dynamo=True,
             verbose=False,
         )  # fmt: skip
     assert program is not None

@@ -10,7 +10,7 @@ from typing import Any
 from cotap.checks import is_finite, legible, quoted, reason_of, require_one_of, require_positive_int, require_range
 
 FORMAT = "cotap-policy-3"
-INPUT, TARGETS = "observation", "joint_targets"
+INPUT, TARGETS, LAW_TARGETS = "observation", "joint_targets", "law_targets"
 STAGES = ("base", "distill")
 UPPER_MODES = ("residual", "absolute")
 PER_JOINT = ("default_pose_rad", "kp", "kd", "torque_limit_nm")
@@ -41,7 +41,8 @@ class PolicyMetadata:
     """(J,)."""
     action: dict[str, Any]
     """`scale_rad` (J,) radians of target per unit of action, `clip` the largest magnitude of an action, and what the
-    arms' actions are added to, `upper_mode`: residual (the reference) or absolute (the default pose)."""
+    arms' actions are added to, `upper_mode`: residual (the reference) or absolute (the default pose). With learned
+    modulation also `law_targets` (M,): what each number of the second output is."""
     observation: dict[str, Any]
     """`terms` (name, width, scale), `history` in steps, `about` each term what it is, its unit and its range, and in
     words `order` and `frames`."""
@@ -58,8 +59,8 @@ class PolicyMetadata:
     law: dict[str, Any]
     """The arms' laws in training (`left`, `right`) and all that belongs to them."""
     golden: dict[str, Any]
-    """A first step worked out: `readings`, the `observation` (O,) that they make, and its `joint_targets` (J,) [rad],
-    to check a robot's loop against."""
+    """A first step worked out: `readings`, the `observation` (O,) that they make, and its `joint_targets` (J,) [rad]
+    (and `law_targets`), to check a robot's loop against."""
     checkpoint_sha256: str
     cotap_version: str
     opset: int
@@ -68,6 +69,11 @@ class PolicyMetadata:
     def observation_width(self) -> int:
         """Numbers in an observation, history included."""
         return self.observation["history"] * sum(width for _, width, _ in self.observation["terms"])
+
+    @property
+    def law_targets(self) -> list[str]:
+        """What the policy asks of the arms' laws, in words; nothing without learned modulation."""
+        return self.action.get("law_targets", [])
 
     def to_properties(self) -> dict[str, str]:
         """As ONNX keeps it."""
@@ -119,7 +125,9 @@ def _check(m: PolicyMetadata) -> None:
             raise ValueError(f"metadata {part} lacks {absent[0]!r}")
     _check_action(m.action, len(m.joints))
     _check_observation(m.observation)
-    for name, count in (("observation", m.observation_width), ("joint_targets", len(m.joints))):
+    golden = {"observation": m.observation_width, "joint_targets": len(m.joints)}
+    golden |= {"law_targets": len(m.law_targets)} if m.law_targets else {}
+    for name, count in golden.items():
         _check_numbers(f"golden.{name}", m.golden.get(name), count, "numbers")
 
 
@@ -129,6 +137,9 @@ def _check_action(action: dict[str, Any], joints: int) -> None:
         require_range("metadata action.scale_rad", value, 1e-6, 1e3)
     require_range("metadata action.clip", action["clip"], 1e-3, 1e6)
     require_one_of("metadata action.upper_mode", action["upper_mode"], UPPER_MODES)
+    targets = action.get("law_targets", [])
+    texts = isinstance(targets, list) and all(isinstance(target, str) for target in targets)
+    _require(texts, "action.law_targets", "a list of texts", targets)
 
 
 def _check_observation(observation: dict[str, Any]) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from cotap.checks import reason_of, shortened
-from cotap.deployment.metadata import INPUT, TARGETS, PolicyError, PolicyMetadata, read_metadata
+from cotap.deployment.metadata import INPUT, LAW_TARGETS, TARGETS, PolicyError, PolicyMetadata, read_metadata
 from cotap.deployment.onnx_file import require_plain_graph
 from cotap.inputs import InputError, read_bytes
 
@@ -26,7 +26,8 @@ FIRST_S = 10.0
 
 
 class OnnxPolicy:
-    """Observation in, joint targets out, on one processor thread.
+    """Observation in, joint targets out, and with learned modulation what is asked of the arms' laws, on one processor
+    thread.
 
     Args:
         path: What `cotap export` wrote.
@@ -65,7 +66,9 @@ class OnnxPolicy:
         self.metadata = read_metadata(where, properties)
         joints, width = len(self.metadata.joints), self.metadata.observation_width
         self._require(where, "inputs", inputs, {INPUT: [1, width]})
-        self._require(where, "outputs", outputs, {TARGETS: [1, joints]})
+        modulated = len(self.metadata.law_targets)
+        self._outputs = {TARGETS: [1, joints], LAW_TARGETS: [1, modulated]} if modulated else {TARGETS: [1, joints]}
+        self._require(where, "outputs", outputs, self._outputs)
         self._input = np.zeros((1, width), dtype=np.float32)
         self._default = np.array(self.metadata.default_pose_rad)
         self._scale = np.array(self.metadata.action["scale_rad"])
@@ -75,10 +78,10 @@ class OnnxPolicy:
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """Joint targets (J,) [rad], float64, of an observation (width,); with residual arms, of the reference that was
-        observed."""
+        observed. With learned modulation (J + M,): behind them, what the metadata's `law_targets` names."""
         self._input[0] = observation
-        (targets,) = self._session.run([TARGETS], {INPUT: self._input})
-        return np.asarray(targets, dtype=np.float64)[0]
+        found = self._session.run(list(self._outputs), {INPUT: self._input})
+        return np.concatenate([np.asarray(part, dtype=np.float64)[0] for part in found])
 
     def offset(self, arm_reference: np.ndarray) -> np.ndarray:
         """What scaled actions are added to (J,) [rad], for the arms' reference (U,) [rad]."""
@@ -98,7 +101,7 @@ class OnnxPolicy:
         timer = threading.Timer(seconds, setattr, (options, "terminate", True))
         timer.start()
         try:
-            self._session.run([TARGETS], {INPUT: self._input}, options)
+            self._session.run(list(self._outputs), {INPUT: self._input}, options)
         except Exception as error:  # as above
             late = options.terminate
             reason = f"took more than {seconds:g} s" if late else f"failed: {shortened(reason_of(error))}"

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from cotap.envs import HumanoidEnvConfig
+from cotap.envs.modulation import OBSERVED_STIFFNESS
 from cotap.envs.observations import Term
 from cotap.robots import RobotSpec
 
@@ -25,6 +26,8 @@ def about_terms(cfg: HumanoidEnvConfig, spec: RobotSpec, terms: tuple[Term, ...]
     moved = [[j.range_rad[i] - j.default_rad for j in joints] for i in (0, 1)]
     velocity = [list(bounds) for bounds in zip(c.velocity_x, c.velocity_y, strict=True)]
     height = [spec.nominal_height_m + offset for offset in c.height_offset]
+    laws = cfg.upper_body.modulation
+    stiffness = [math.log(bound / OBSERVED_STIFFNESS) for bound in laws.stiffness]
     about: dict[str, tuple[str, str, Any]] = {
         "torso_angular_velocity": ("of the torso link, in its own frame: x, y, z", "rad/s", None),
         "projected_gravity": ("unit vector that points down, in the torso link's frame", "1", [-1.0, 1.0]),
@@ -39,12 +42,14 @@ def about_terms(cfg: HumanoidEnvConfig, spec: RobotSpec, terms: tuple[Term, ...]
         "sin_phase": ("sine of the gait's phase; 0 while standing", "1", [-1.0, 1.0]),
         "cos_phase": ("cosine of the gait's phase; 0 while standing", "1", [-1.0, 1.0]),
         "arm_torque": ("torque of the arms' law at present, within limits", "Nm", [[-t for t in limits], limits]),
-    }
+        "law_alpha": ("alpha of each arm's law at present", "1", list(laws.alpha)),
+        "law_log_stiffness": (f"logarithm of stiffness along x, y, z over {OBSERVED_STIFFNESS:g} N/m", "1", stiffness),
+    }  # fmt: skip
     return {name: dict(zip(("what", "unit", "range"), about[name], strict=True)) for name, _, _ in terms}
 
 
 def golden_moment(
-    spec: RobotSpec, terms: tuple[Term, ...], history: int, seed: int
+    cfg: HumanoidEnvConfig, spec: RobotSpec, terms: tuple[Term, ...], history: int, seed: int
 ) -> tuple[dict[str, list[float]], torch.Tensor]:
     """Readings of the first step of a robot that is asked to stand, and the observation (W,) that they make.
 
@@ -58,11 +63,14 @@ def golden_moment(
         for n, scale in ((len(default), 0.1), (len(default), 0.5), (3, 0.3), (2, 0.1))
     )
     gravity = [*tilt, -math.sqrt(1.0 - tilt[0] ** 2 - tilt[1] ** 2)]
+    laws = [cfg.upper_body.of(arm.side) for arm in spec.arms]
     position = (default + torch.tensor(moved, dtype=torch.float64)).tolist()
     values = {
         "torso_angular_velocity": turn, "projected_gravity": gravity, "command_stand": [1.0],
         "command_height": [spec.nominal_height_m], "reference_arm_position": default[len(spec.lower_joints) :].tolist(),
         "joint_position": moved, "joint_velocity": rates,
+        "law_alpha": [law.alpha for law in laws],
+        "law_log_stiffness": [math.log(k / OBSERVED_STIFFNESS) for law in laws for k in law.stiffness],
     }  # fmt: skip
     rows = [scale * torch.tensor(values.get(name, [0.0] * width)).repeat(history) for name, width, scale in terms]
     readings = {"joint_pos": position, "joint_vel": rates, "angular_velocity": turn, "gravity": gravity}
