@@ -30,6 +30,7 @@ from cotap.evaluation.recording import RecordingProtocol
 from cotap.evaluation.report import require_outputs, sheet_path
 from cotap.evaluation.stability import Stability
 from cotap.evaluation.static import StaticStiffness
+from cotap.evaluation.task import Task
 from cotap.evaluation.tour.protocol import Tour
 from cotap.evaluation.velocity_tracking import VelocityTracking
 from cotap.files import require_output
@@ -54,6 +55,7 @@ PROTOCOLS: dict[str, type[Protocol]] = {
     "tour": Tour,
     "fall-curve": FallCurve,
     "modulation": Modulation,
+    "task": Task,
 }
 RECORDING = "recording"
 """The protocol that simulates nothing: it measures a recording of `cotap play`."""
@@ -161,7 +163,10 @@ def prepare(options: Options[Protocol]) -> tuple[HumanoidEnv, Policy, str]:
     cfg = policy.env_config
     cfg.upper_body, cfg.num_threads = arms_of(options, policy), options.threads
     cfg.backend = resolve_backend(options.backend)
-    env = HumanoidEnv(protocol.configure(cfg))
+    cfg = protocol.configure(cfg)
+    if protocol.drives or cfg.fixed_base:  # another sets the laws, or there is no policy that could
+        cfg.upper_body.modulation.hold()
+    env = HumanoidEnv(cfg)
     require_layout(path, policy.layout, json.loads(json.dumps(env.layout())))
     protocol.prepare(env)
     return env, policy.to(env.device), sha256(path)

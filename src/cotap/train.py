@@ -40,6 +40,7 @@ SHORTCUTS = {
     "--num-envs": "--env.num-envs",
     "--iterations": "--runner.iterations",
     "--backend": "--env.backend",
+    "--modulation": "--env.upper-body.modulation.kind",
 }
 
 
@@ -67,7 +68,8 @@ class BaseOptions:
 class DistillOptions:
     """Stage 2: arms under compliance, a policy that begins as the base and is guided by it while it learns.
 
-    `--num-envs`, `--iterations` and `--backend` are short for `--env.num-envs`, `--runner.iterations`, `--env.backend`.
+    `--num-envs`, `--iterations` and `--backend` are short for `--env.num-envs`, `--runner.iterations`, `--env.backend`;
+    `--modulation` for `--env.upper-body.modulation.kind`.
     """
 
     run_dir: str = ""
@@ -79,9 +81,10 @@ class DistillOptions:
     """Base policy to start from: a file, or a shipped policy's name. It guides the new policy as well. By default the
     shipped base policy."""
     recipe: str = "default"
-    """default, quick, paper, facet, no-ratio, torque-critic or goals. default: 80 to 1200 N/m. quick: a short default.
-    paper: 150 to 450 N/m. facet: arms under FACET, with its tracking reward. The others are ablations; the last two
-    change what the networks see, and the networks of the base are refitted."""
+    """default, quick, paper, facet, modulated, no-ratio, torque-critic or goals. default: 80 to 1200 N/m. quick: a
+    short default. paper: 150 to 450 N/m. facet: arms under FACET, with its tracking reward. modulated: the policy sets
+    alpha and stiffness. The others are ablations. The last two and modulated change what the networks see or do, and
+    the networks of the base are refitted."""
     command: tyro.conf.Suppress[str] = ""
     training: Annotated[DistillTraining, tyro.conf.arg(name="")] = field(default_factory=DistillTraining)
 
@@ -332,7 +335,8 @@ def _guide(env: Any, options: DistillOptions, base: dict[str, Any] | None) -> An
     training = options.training
     model = DualActorCritic(layout_of(env, training.ppo.symmetric), training.ppo.hidden, training.ppo.initial_std)
     if base is not None:
-        take_over(options.base_checkpoint, base, model, env, options.recipe in OTHER_TERMS)
+        others = options.recipe in OTHER_TERMS or training.env.upper_body.modulation.kind != "none"
+        take_over(options.base_checkpoint, base, model, env, others)
     return Guide(model.to(training.device), training.distillation)
 
 

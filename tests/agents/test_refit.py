@@ -14,8 +14,11 @@ from cotap.agents.actors import DualActorCritic, Observations, as_dict
 from cotap.agents.checkpoint import CheckpointError
 from cotap.agents.refit import columns, take_over
 from cotap.agents.runner import layout_of
+from cotap.compliance.laws import LawConfig
 from cotap.envs import HumanoidEnv
+from cotap.envs.modulation import ModulationConfig
 from cotap.envs.observations import NoiseConfig, ObservationConfig
+from cotap.envs.upper_body import UpperBodyConfig
 
 HISTORY, TORQUES, GOALS = 5, 8, 10
 STEP = 86
@@ -177,3 +180,28 @@ def test_networks_of_another_width_are_refused(make_env: MakeEnv):
     wide = DualActorCritic(layout_of(now), (32, 8), 1.0)
     with pytest.raises(CheckpointError, match="other networks"):
         take_over("c.pt", content(before, trained(before, True)), wide, now, other_terms=True)
+
+
+@pytest.mark.parametrize("symmetric", [True, False])
+@pytest.mark.parametrize("kind", ["alpha", "stiffness"])
+def test_new_actions_are_zero_at_first(make_env: MakeEnv, symmetric: bool, kind: str):
+    laws = [LawConfig("cotap", alpha=0.5) for _ in range(2)]
+    before, now = make_env(), make_env(upper_body=UpperBodyConfig(*laws, modulation=ModulationConfig(kind)))
+    old, new = trained(before, symmetric), fresh(now, symmetric)
+    assert take_over("c.pt", content(before, old), new, now, other_terms=True)
+    x = observations(now, 2)
+    shown, joints = now.num_actions - before.num_actions, before.num_actions
+    steps = {"privileged": 0, "present": 1, "policy": HISTORY, "clean": HISTORY}
+    without = {k: v[:, : v.shape[1] - steps[k] * shown] for k, v in x.items()}
+    action = new.eval()(x)
+    torch.testing.assert_close(action[:, :joints], old(without))
+    assert not action[:, joints:].any()
+    torch.testing.assert_close(values(new, x), values(old, without))
+    arms = len(old.log_std["upper"])
+    assert torch.equal(new.log_std["upper"][:arms], old.log_std["upper"])
+    assert torch.equal(new.log_std["upper"][arms:], torch.zeros(shown))  # as fresh networks explore
+    new(x)[:, joints:].sum().backward()
+    last = "output_weight" if symmetric else "mlp.4.weight"
+    assert float(dict(new.actors["upper"].named_parameters())[last].grad[arms:].abs().max()) > 0.0  # they can learn
+    with pytest.raises(CheckpointError, match="other networks"):
+        take_over("c.pt", content(now, new), fresh(before, symmetric), before, other_terms=True)

@@ -1,4 +1,5 @@
-"""Giving a trained policy another observation: what it no longer sees is dropped, what is new is at first ignored."""
+"""Giving a trained policy another observation: what it no longer sees is dropped, what is new is at first ignored.
+Actions that it did not have are zero at first."""
 
 from __future__ import annotations
 
@@ -11,7 +12,7 @@ from cotap.agents.actors import DualActorCritic, as_dict
 from cotap.agents.checkpoint import MALFORMED, CheckpointError, load_weights, require_layout, same
 from cotap.checks import reason_of
 
-REFITTED = ("terms", "critic_terms")
+REFITTED = ("terms", "critic_terms", "modulation")
 """What two layouts may differ in for `refit` to go from one to the other."""
 FIRST_LAYER = ("weights.0", "mlp.0.weight")
 """How the weights that an observation meets are called, in symmetric and plain networks."""
@@ -41,7 +42,7 @@ def take_over(path: str, content: dict[str, Any], model: DualActorCritic, env: A
         CheckpointError: it was trained for something else.
     """
     present, saved = json.loads(json.dumps(env.layout())), content["layout"]
-    refits = other_terms and any(not same(saved.get(key), present[key]) for key in REFITTED)
+    refits = other_terms and any(not same(saved.get(key), present.get(key)) for key in REFITTED)
     require_layout(path, saved, {k: v for k, v in present.items() if not (refits and k in REFITTED)})
     try:
         if refits:
@@ -60,7 +61,8 @@ def refit(
 
     Columns keep their weights and statistics. A term that has gone counts as being at its mean. A new one has weights
     of zero and the statistics that `fresh` has for it. A critic takes over weights and statistics of a term that its
-    actor saw until now.
+    actor saw until now. New actions come after those that `model` has: their outputs are zero, and they are explored as
+    `fresh` explores them.
 
     Args:
         model: State of the networks that were trained.
@@ -80,9 +82,24 @@ def refit(
         elif name.endswith(FIRST_LAYER):
             groups = fresh.layout.obs_groups["actor" if part == "actors" else "critic"]
             _take(value.zero_(), model[name], _joined(before, groups), _joined(now, groups))
+        elif part in ("actors", "log_std") and len(model[name]) != len(value):
+            _extend(value.zero_() if part == "actors" else value, model[name], _new_actions(saved, present))
         else:
             value.copy_(model[name])
     return state
+
+
+def _new_actions(saved: dict[str, Any], present: dict[str, Any]) -> int:
+    """How many more actions there are now."""
+    before, now = (len(layout.get("modulation", {}).get("targets", [])) for layout in (saved, present))
+    return now - before
+
+
+def _extend(value: torch.Tensor, old: torch.Tensor, new: int) -> None:
+    """Put `old` before the `new` rows that `value` has more. Raises ValueError if it has another number more."""
+    if len(old) + new != len(value):
+        raise ValueError(f"{len(value)} actions for {len(old)} and {new} new ones")
+    value[: len(old)] = old
 
 
 def _joined(places: Columns, groups: list[str]) -> list[tuple[str, int]]:

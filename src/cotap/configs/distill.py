@@ -9,7 +9,9 @@ from dataclasses import dataclass, field
 from cotap.agents.distillation import DistillationConfig
 from cotap.compliance.laws import LawConfig
 from cotap.configs.base import BaseTraining, facet_rewards
+from cotap.envs.arm_task import TASK_WEIGHTS, task_forces
 from cotap.envs.curriculum import AssistConfig, RampConfig
+from cotap.envs.modulation import ModulationConfig
 from cotap.envs.upper_body import LawSampling, UpperBodyConfig
 
 
@@ -96,6 +98,21 @@ def facet(base: BaseTraining) -> DistillTraining:
     return training
 
 
+def modulated(base: BaseTraining) -> DistillTraining:
+    """The upper agent sets alpha and stiffness itself, for a task in which that pays (`cotap.envs.arm_task`); 60 M
+    samples."""
+    training = default(base)
+    env, law = training.env, LawConfig(name="cotap", alpha=0.5)
+    env.upper_body = UpperBodyConfig(law, copy.deepcopy(law), modulation=ModulationConfig("stiffness"))
+    env.forces = task_forces()
+    for name, weight in TASK_WEIGHTS.items():
+        setattr(env.rewards.upper, name, weight)
+    env.rewards.upper.track_arms = env.rewards.upper.track_key_points = 0.0  # which would not give way
+    training.ppo.upper_gamma = 0.97  # a hand that gave way takes half a second to return
+    training.runner.iterations = 2441
+    return training
+
+
 DISTILL_RECIPES: dict[str, Callable[[BaseTraining], DistillTraining]] = {
     "default": default,
     "quick": quick,
@@ -104,7 +121,8 @@ DISTILL_RECIPES: dict[str, Callable[[BaseTraining], DistillTraining]] = {
     "torque-critic": with_torque_for_critics,
     "goals": with_goals,
     "facet": facet,
+    "modulated": modulated,
 }
 """Stage 2, by name."""
-OTHER_TERMS = ("torque-critic", "goals")
-"""Recipes that change what networks see, and so refit those of the base that they begin from."""
+OTHER_TERMS = ("torque-critic", "goals", "modulated")
+"""Recipes that change what networks see or do, and so refit those of the base that they begin from."""

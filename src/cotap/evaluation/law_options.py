@@ -18,7 +18,8 @@ OF_ALL_ARMS = {"torso_compliance": "stiffness", "singularity_ratio": "condition_
 @dataclass
 class LawOptions:
     """Laws of the arms. What is not given is as the policy was trained, or for another law as the law has it. A
-    policy that was trained under PD has the protocol's own law, if it has one."""
+    policy that was trained under PD has the protocol's own law, if it has one. A policy that sets alpha and stiffness
+    itself no longer does once a method, a law, alpha or stiffness is given."""
 
     method: str | None = None
     """Law of both arms: pd, soft-pd, cotap, facet, cotap+facet, cotap+facet-matched, hmc or dcc."""
@@ -65,6 +66,8 @@ class LawOptions:
             out.torso.model = self.torso_compliance
         if self.singularity_ratio is not None:
             out.singularity_ratio = self.singularity_ratio
+        if self._fixes_laws():
+            out.modulation.hold()
         out.check()
         self._require_read({side: out.of(side).name for side in SIDES})
         return out
@@ -72,6 +75,10 @@ class LawOptions:
     def given(self) -> list[str]:
         """Names of the options that were given, `left` and `right` aside."""
         return [f.name for f in fields(self) if f.name not in SIDES and getattr(self, f.name) != f.default]
+
+    def _fixes_laws(self) -> bool:
+        """Whether what a policy could set of the laws is given."""
+        return any(getattr(self, name) not in (None, "") for name in ("method", "stiffness", "alpha", *SIDES))
 
     def require_free(self, driven: Mapping[str, str]) -> None:
         """Raise ValueError if a field of laws is given that a protocol sets itself, by the option in `driven`."""

@@ -103,12 +103,14 @@ def load_policy(path: Path | str) -> Policy:
 
 
 def _require_fitting(networks: AgentLayout, layout: dict[str, Any]) -> None:
-    """Raise ValueError unless actors read the observation that `layout` tells of, and move its joints in order."""
+    """Raise ValueError unless actors read the observation that `layout` tells of, and move its joints in order, and
+    perhaps its laws."""
     width = layout["history"] * sum(width for _, width, _ in layout["terms"])
     if networks.obs_groups["actor"] != ["policy"] or networks.width("actor") != width:
         raise ValueError(f"actors do not read the layout's observation of {width} numbers alone")
     parts = networks.action_slices.values()
-    if [*(s.start for s in parts), len(layout["joints"])] != [0, *(s.stop for s in parts)]:
+    count = len(layout["joints"]) + len(layout.get("modulation", {}).get("targets", []))
+    if [*(s.start for s in parts), count] != [0, *(s.stop for s in parts)]:
         raise ValueError(
             f"actions of {networks.action_slices} are not those of {len(layout['joints'])} joints in order"
         )

@@ -231,6 +231,7 @@ def play_config(env_cfg: HumanoidEnvConfig, library: str = "") -> HumanoidEnvCon
     env_cfg.num_envs, env_cfg.num_threads, env_cfg.backend = len(ROBOTS), 1, "mujoco"
     env_cfg.terminations.episode_s = 1e6
     env_cfg.upper_body.sampling.enabled = False  # what the page sets stays
+    env_cfg.upper_body.modulation.hold()
     env_cfg.motions.clips.share, env_cfg.motions.clips.only, env_cfg.motions.clips.held_out = 1.0, (), ()
     for weights in (env_cfg.rewards.lower, env_cfg.rewards.upper):  # nobody learns here; a group must have one term
         for name in vars(weights):
