@@ -46,7 +46,7 @@ from cotap.sim.loop_batch import LoopBatch
 class SimulationStepping:
     """`Simulation.step` on a recording, every env with masses of its own; only the stepping is timed.
 
-    With one thread, its time is the processor's, which other programs hardly change.
+    With one thread, its time is the CPU's, which other programs hardly change.
     """
 
     def __init__(self, recording: Recording, seconds: float, threads: int, make_batch: MakeBatch) -> None:

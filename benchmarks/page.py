@@ -138,8 +138,8 @@ class Speed:
                 play.terminate()
                 play.wait(30.0)
         return (
-            f"page answers after {answers:.1f} s, can be used after {usable:.1f} s ({busy:.1f} s of processor time)\n"
-            f"{self.viewers} viewers: {at_pace:.1f} control steps/s at speed 1 ({at_pace_ms:.1f} ms of processor time "
+            f"page answers after {answers:.1f} s, can be used after {usable:.1f} s ({busy:.1f} s of CPU time)\n"
+            f"{self.viewers} viewers: {at_pace:.1f} control steps/s at speed 1 ({at_pace_ms:.1f} ms of CPU time "
             f"each), {at_most:.1f} at speed 4 ({at_most_ms:.1f} ms)"
         )
 
@@ -272,7 +272,7 @@ class Film:
             fill(page, "force [N]", self.force)
             page.get_by_role("button", name="Push forward", exact=True).click()
 
-        for notice in page.get_by_role("alert").all():  # of drawing without a graphics card
+        for notice in page.get_by_role("alert").all():  # of drawing without a GPU
             notice.get_by_role("button").click()
         page.get_by_label("policy moves arms").click()  # the law alone
         page.get_by_label("paused").click()

@@ -96,7 +96,7 @@ class Static:
     sensing: str = "privileged"
     """Force on the hand: privileged or estimated."""
     threads: int = 0
-    """Processor threads; 0 takes every processor."""
+    """CPU threads; 0 takes every CPU."""
     seed: int = 0
     """Seed of envs."""
     laws: tuple[str, ...] = AT_REST
@@ -185,7 +185,7 @@ class Transient:
     torque_limit_scale: float = 1.0
     """Factor on the robot's torque limits."""
     threads: int = 0
-    """Processor threads; 0 takes every processor."""
+    """CPU threads; 0 takes every CPU."""
     seed: int = 0
     """Seed of envs."""
     laws: tuple[str, ...] = STRUCK
@@ -286,7 +286,7 @@ class Properties:
     settle_seconds: float = 8.0
     """How long a load is left to settle [s]."""
     threads: int = 0
-    """Processor threads; 0 takes every processor."""
+    """CPU threads; 0 takes every CPU."""
     laws: tuple[str, ...] = tuple(ROWS)
     """Rows to measure."""
     output: str = "runs/laws"

@@ -572,7 +572,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="128 envs a row; minutes instead of hours")
     parser.add_argument("--num-envs", type=int, default=0, help="envs a row; 4096, or 128 with --quick")
-    parser.add_argument("--threads", type=int, default=0, help="0 takes every processor")
+    parser.add_argument("--threads", type=int, default=0, help="0 takes every CPU")
     parser.add_argument("--motion", default="mixture", help="the arms' reference in the impact tables")
     parser.add_argument(
         "--out",

@@ -27,7 +27,7 @@ class Options:
     output: str = "runs/sim_to_sim"
     """Folder for report.md, report.json and report.png; parts/ keeps what is done, and is gone on with."""
     jobs: int = 0
-    """Processes that share the trials; 0 takes one per processor."""
+    """Processes that share the trials; 0 takes one per CPU."""
     comparison: tyro.conf.OmitArgPrefixes[Comparison] = field(default_factory=Comparison)
 
 

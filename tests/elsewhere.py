@@ -1,9 +1,9 @@
 """A device that is none: tensors that say they are on it, refuse to meet those that are not, and compute all the same.
 
-Where there is no graphics card, code that forgets where its tensors belong goes unnoticed: everything is on the
-processor. Within `elsewhere()`, whatever is made on `DEVICE` holds its numbers on the processor, says that it is on
-`DEVICE`, and makes every operation fail that mixes it with a tensor (of one dimension or more) on the processor,
-except copies from one to the other, as graphics cards do; turning it into an array fails as it does there.
+Where there is no GPU, code that forgets where its tensors belong goes unnoticed: everything is on the
+CPU. Within `elsewhere()`, whatever is made on `DEVICE` holds its numbers on the CPU, says that it is on
+`DEVICE`, and makes every operation fail that mixes it with a tensor (of one dimension or more) on the CPU,
+except copies from one to the other, as GPUs do; turning it into an array fails as it does there.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _COPIES = (torch.ops.aten.copy_.default, torch.ops.aten._to_copy.default)
 
 
 class Elsewhere(torch.Tensor):
-    """A tensor on `DEVICE`; `held` has its numbers, on the processor."""
+    """A tensor on `DEVICE`; `held` has its numbers, on the CPU."""
 
     held: torch.Tensor
 
@@ -55,7 +55,7 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     if there and func not in _COPIES:
         for t in tensors:
             if not isinstance(t, Elsewhere) and t.dim() > 0:
-                raise RuntimeError(f"{func}: a tensor {tuple(t.shape)} is on the processor, others on {DEVICE}")
+                raise RuntimeError(f"{func}: a tensor {tuple(t.shape)} is on the CPU, others on {DEVICE}")
     goes = bool(there)
     if func is torch.ops.aten.copy_.default:
         goes = isinstance(args[0], Elsewhere)

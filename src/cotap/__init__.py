@@ -10,7 +10,7 @@ except PackageNotFoundError:  # a source tree that was never installed
 
 
 # torch's threads go on spinning for milliseconds after every operation that they share (GNU OpenMP's default), on the
-# processors that physics wants by then: at 512 envs a step of the environment takes 1.2 times as long. Read when
+# CPUs that physics wants by then: at 512 envs a step of the environment takes 1.2 times as long. Read when
 # torch is loaded.
 os.environ.setdefault("GOMP_SPINCOUNT", "20000")
 

@@ -11,7 +11,7 @@ _CONTAINER = Path("/sys/fs/cgroup/memory.max")
 
 
 def free_bytes(device: str = "cpu") -> int | None:
-    """Memory that could be taken now on a processor or a graphics card; None where that cannot be told."""
+    """Memory that could be taken now on a CPU or a GPU; None where that cannot be told."""
     if device.startswith("cuda"):
         import torch
 

@@ -38,7 +38,7 @@ def restored(name: str, value: Any, like: torch.Tensor) -> torch.Tensor:
 
 
 def on_processor(state: Any) -> Any:
-    """`state`, dicts and lists of tensors and plain data, with every tensor on the processor."""
+    """`state`, dicts and lists of tensors and plain data, with every tensor on the CPU."""
     if isinstance(state, torch.Tensor):
         return state.cpu()
     if isinstance(state, dict):

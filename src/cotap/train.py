@@ -350,7 +350,7 @@ def provenance(command: str, backend: str) -> dict[str, str]:
     except (OSError, subprocess.CalledProcessError):
         commit = f"cotap {__version__}"
     simulation = f"{resolve_backend(backend)}, MuJoCo {mujoco.__version__}"
-    machine = f"{platform.machine()}, {os.cpu_count()} processors, Python {platform.python_version()}"
+    machine = f"{platform.machine()}, {os.cpu_count()} CPUs, Python {platform.python_version()}"
     return {"commit": commit, "command": command, "machine": machine, "simulation": simulation}
 
 

@@ -1,4 +1,4 @@
-"""The environment on a device that is not the processor: the same numbers, and nothing forgotten on the way."""
+"""The environment on a device that is not the CPU: the same numbers, and nothing forgotten on the way."""
 
 from __future__ import annotations
 
@@ -85,5 +85,5 @@ def test_an_environment_elsewhere_computes_the_same(monkeypatch, robot):
     ],
 )
 def test_what_is_forgotten_on_the_processor_is_found(forgotten, monkeypatch):
-    with elsewhere(monkeypatch.setattr), pytest.raises(RuntimeError, match=r"on the processor|numpy"):
+    with elsewhere(monkeypatch.setattr), pytest.raises(RuntimeError, match=r"on the CPU|numpy"):
         forgotten(torch.ones(3, device=DEVICE))

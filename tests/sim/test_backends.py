@@ -20,7 +20,7 @@ from cotap.train import main as train
 
 @pytest.fixture
 def machine(monkeypatch):
-    """Pretends that there is a graphics card, or the extra `warp`, or mjbatch and the MuJoCo that it pins, or not."""
+    """Pretends that there is a GPU, or the extra `warp`, or mjbatch and the MuJoCo that it pins, or not."""
 
     def pretend(card: bool, warp: bool, mjbatch: bool = True, pin: str = mujoco.__version__) -> None:
         def requires(_: str) -> list[str]:

@@ -1,4 +1,4 @@
-"""MuJoCo Warp, on its processor device, against MuJoCo: the same envs, as far as float32 goes.
+"""MuJoCo Warp, on its CPU device, against MuJoCo: the same envs, as far as float32 goes.
 
 The first run compiles Warp's kernels, minutes on one core; they are kept in Warp's cache.
 """

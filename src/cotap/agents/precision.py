@@ -1,4 +1,4 @@
-"""Which precision the networks run in, chosen from what the processor offers."""
+"""Which precision the networks run in, chosen from what the CPU offers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ PRECISIONS = ("auto", "bf16", "fp32")
 def resolve_precision(precision: str, device: str) -> torch.dtype:
     """The networks' compute type: bfloat16 where `auto` finds hardware for it, else float32.
 
-    On processors without AVX512-BF16 or AMX, bfloat16 is emulated and slower than float32.
+    On CPUs without AVX512-BF16 or AMX, bfloat16 is emulated and slower than float32.
     """
     require_one_of("precision", precision, PRECISIONS)
     if precision == "auto":

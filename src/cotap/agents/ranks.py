@@ -66,18 +66,18 @@ class Ranks:
         return seed + 1_000_003 * self.rank
 
     def threads(self, threads: int) -> int:
-        """`threads`, or where that is 0 this process' share of the host's processors."""
+        """`threads`, or where that is 0 this process' share of the host's CPUs."""
         if threads or self.size == 1:
             return threads
         return max(1, (os.cpu_count() or 1) // self.local_size)
 
     def device(self, device: str) -> str:
-        """`device`, but of several graphics cards this process' own."""
+        """`device`, but of several GPUs this process' own."""
         return f"cuda:{self.local_rank}" if self.size > 1 and torch.device(device).type == "cuda" else device
 
     @contextmanager
     def joined(self, device: str) -> Iterator[None]:
-        """Connect with the other ranks: gloo between processors, NCCL between graphics cards."""
+        """Connect with the other ranks: gloo between CPUs, NCCL between GPUs."""
         if self.size == 1:
             yield
             return
@@ -131,7 +131,7 @@ class Ranks:
         return (value - mean) / ((squares / (self.size * value.shape[0] - 1)).sqrt() + 1e-8)
 
     def gather(self, make: Callable[[], Any]) -> list[Any]:
-        """What `make` gives on ranks 1, 2, ..., at rank 0; elsewhere nothing. Plain data and tensors, on processors.
+        """What `make` gives on ranks 1, 2, ..., at rank 0; elsewhere nothing. Plain data and tensors, on CPUs.
 
         They travel as checkpoints do, so that no process can make another run code.
         """

@@ -26,7 +26,7 @@ FIRST_S = 10.0
 
 
 class OnnxPolicy:
-    """Observation in, joint targets out, and with learned modulation what is asked of the arms' laws, on one processor
+    """Observation in, joint targets out, and with learned modulation what is asked of the arms' laws, on one CPU
     thread.
 
     Args:
@@ -118,7 +118,7 @@ class OnnxPolicy:
 
 
 def inference_ms(policy: OnnxPolicy, calls: int = 2000) -> tuple[float, float]:
-    """Median and 99th percentile of the time of one call [ms], on one processor thread, observations differing."""
+    """Median and 99th percentile of the time of one call [ms], on one CPU thread, observations differing."""
     rng = np.random.default_rng(0)
     observations = rng.normal(size=(64, policy.metadata.observation_width)).astype(np.float32)
     seconds = np.zeros(calls)

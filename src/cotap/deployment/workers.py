@@ -24,7 +24,7 @@ _policy: OnnxPolicy | None = None
 
 
 class Workers:
-    """Runs trials of one policy in `jobs` processes, each on one processor thread; with one job in this process.
+    """Runs trials of one policy in `jobs` processes, each on one CPU thread; with one job in this process.
 
     Args:
         path: The policy.

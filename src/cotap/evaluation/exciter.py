@@ -94,7 +94,7 @@ def next_generation(
         genes: (N, G) that were tried.
         worth: (N,) what each got; larger is better, NaN is worst.
         group: (N,) number of its group, from 0; groups do not mix.
-        rng: On the processor.
+        rng: On the CPU.
         spread: Standard deviation of what is added.
     """
     out, worth = genes.clone(), worth.nan_to_num(-math.inf, math.inf)

@@ -63,7 +63,7 @@ class Tally:
             self.store = torch.where(self.fell, self.store, torch.fmin(self.store, store[:, 0]))
 
     def finished(self, diverged: bool) -> Tally:
-        """On the processor; with everything drawn where it fell, if a fall means that it has `diverged`."""
+        """On the CPU; with everything drawn where it fell, if a fall means that it has `diverged`."""
         most = torch.where(self.fell, math.inf, self.most) if diverged else self.most
         return Tally(*(x.cpu() for x in (self.drawn, most, self.taken, self.given, self.store, self.fell)))
 

@@ -1,4 +1,4 @@
-"""Pictures that need no OpenGL: a ray per pixel, which MuJoCo follows on the processor."""
+"""Pictures that need no OpenGL: a ray per pixel, which MuJoCo follows on the CPU."""
 
 from __future__ import annotations
 

@@ -83,7 +83,7 @@ def record_rollout(
 
     Args:
         env: The envs.
-        policy: Actions of observations, on the envs' device; what is recorded is on the processor.
+        policy: Actions of observations, on the envs' device; what is recorded is on the CPU.
         steps: Number of control steps.
         progress: Whether to show a progress bar.
         before_step: Called before every step with the environment and the step's number: commands, parameters of laws.

@@ -140,7 +140,7 @@ class StaticResult:
 
 @dataclass(frozen=True)
 class Settled:
-    """What a load that is held does to N hands; on the processor."""
+    """What a load that is held does to N hands; on the CPU."""
 
     moved: torch.Tensor
     """(N, 3) displacement against the torso, heading frame [m]."""

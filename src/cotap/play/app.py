@@ -268,7 +268,7 @@ class App:
                 setattr(scene, name, bool(event.target.value))
 
             box.on_update(update)
-        shadows = gui.add_checkbox("shadows", False, hint="slow in a browser without a graphics card")
+        shadows = gui.add_checkbox("shadows", False, hint="slow in a browser without a GPU")
 
         async def cast(event: viser.GuiEvent[Any]) -> None:
             scene.cast_shadows(bool(event.target.value))

@@ -102,7 +102,7 @@ class Scene:
         self._server.flush()
 
     def cast_shadows(self, on: bool) -> None:
-        """Whether things cast shadows; without a graphics card, a browser draws few pictures per second then."""
+        """Whether things cast shadows; without a GPU, a browser draws few pictures per second then."""
         self._server.scene.configure_default_lights(cast_shadow=on)
 
     def to_robot(self, point: tuple[float, float, float], robot: int) -> tuple[float, ...]:

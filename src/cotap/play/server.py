@@ -43,7 +43,7 @@ def empty(server: viser.ViserServer) -> None:
 def _prepare(server: viser.ViserServer) -> None:
     server.gui.configure_theme(show_share_button=False, show_logo=False, control_width="large")
     server.gui.main_panel.dock_right()  # beside the scene, not upon it
-    # A browser that draws without a graphics card takes seconds to prepare an environment map, and as long for every
+    # A browser that draws without a GPU takes seconds to prepare an environment map, and as long for every
     # few frames with it or with shadows.
     server.scene.configure_environment_map(hdri=None)
     server.scene.configure_default_lights(cast_shadow=False)

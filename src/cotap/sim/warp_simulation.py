@@ -1,4 +1,4 @@
-"""Worlds on a graphics card: MuJoCo Warp, float32, the whole physics step as one graph. Needs the extra `warp`."""
+"""Worlds on a GPU: MuJoCo Warp, float32, the whole physics step as one graph. Needs the extra `warp`."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class WarpSimulation(Simulation):
             mjw.set_const(self._model, self._data)
 
     def _capture(self) -> wp.Graph | None:
-        """The physics step as a CUDA graph, launched with one call; none on the processor."""
+        """The physics step as a CUDA graph, launched with one call; none on the CPU."""
         # What a step allocates on the way must come from a memory pool to be part of a graph.
         if not (self._place.is_cuda and wp.is_mempool_enabled(self._place)):
             return None

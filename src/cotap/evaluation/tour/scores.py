@@ -118,7 +118,7 @@ class TourScorer:
             self._yaw_error[:, segment] = torch.where(self.standing, turn.abs(), math.nan)
 
     def measures(self) -> TourMeasures:
-        """Of all steps so far, on the processor."""
+        """Of all steps so far, on the CPU."""
         errors = self._position_error, self._yaw_error
         values = (self._dt * self._survived, self.standing, *errors, self._energy, self._vibration)
         return TourMeasures(*(value.cpu() for value in values))
