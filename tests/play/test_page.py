@@ -208,7 +208,7 @@ def test_a_walk_through_the_page(page: Page, tmp_path: Path):
     page.button("Stop and save")
     page.until("it is written", lambda: page.app.archive.path is not None)
     assert page.app.archive.newest.trajectory.fell.shape[1] == 2
-    page.page.screenshot(path=tmp_path / "side_by_side.png")
+    page.page.screenshot(path=tmp_path / "side_by_side.png", timeout=1000.0 * PATIENCE_S)
     assert (tmp_path / "side_by_side.png").stat().st_size > 20_000
     assert page.complaints == []
 
@@ -228,7 +228,7 @@ def test_a_hand_is_dragged_by_the_mouse_and_the_page_says_how_stiff_it_feels(pag
     page.until("the hand is held", lambda: page.app.session.values["a.left.drag"] is not None)
     page.app.mailbox.set("speed", 0.2)
     page.app.mailbox.set("paused", False)
-    row = page.page.get_by_role("row").filter(has_text="left")
+    row = page.page.get_by_role("row").filter(has_text="left").first
     page.until("it is felt", lambda: float(row.get_by_role("cell").nth(1).inner_text().strip("()-") or 0.0) > 3.0)
     page.until("it gives way", lambda: float(row.get_by_role("cell").nth(2).inner_text().strip("()-") or 0.0) > 0.5)
     asked = row.get_by_role("cell").nth(4)
@@ -340,7 +340,7 @@ def test_the_tour_sets_pushes_and_says_what_to_see(page: Page):
         page.button("Next")
     page.page.get_by_text("3 of 5: Asked for, or left to the pose.").wait_for()
     page.until("B is under PD", lambda: values["side_by_side"] and values["b.left.law"] == "pd")
-    page.page.get_by_role("row").filter(has_text="B left").wait_for()
+    page.page.get_by_role("row").filter(has_text="B left").first.wait_for()
     assert page.complaints == []
 
 
@@ -371,7 +371,6 @@ def test_another_robot_comes_onto_the_same_page(free_port: int, tmp_path: Path):
             page.page.keyboard.down("w")
             page.until("keys drive it", lambda app=app: app.session.values["velocity_x"] > 0.0)
             page.page.keyboard.up("w")
-        page.page.screenshot(path=tmp_path / "robot.png")
         assert page.page.get_by_role("tab", name="Robot").count() == 1
         # Between the two robots, a slow browser may have updates to come of plots that went.
         assert [text for text in page.complaints if "non-existent component" not in text] == []

@@ -72,7 +72,7 @@ function down(event) {
     held.add(event.code);
     event.target.blur?.(); // so that space is not the button that was pressed last
     tell();
-  } else if (event.code === "Space" && !event.target.matches(":focus-visible")) { // no button reached by the tab key
+  } else if (event.code === "Space" && !event.target.matches?.(":focus-visible")) { // no button reached by the tab key
     event.preventDefault();
     event.target.blur?.();
     held.clear();
