@@ -181,7 +181,7 @@ class App:
             if now >= due["status"]:
                 due["status"] = now + 1.0 / STATUS_HZ
                 self._show_status()
-                self._show_felt()
+                self._felt.content = self.readout.table(self._shown())
             if not self.archive.drawing.acquire(blocking=False):
                 continue
             try:
@@ -211,12 +211,6 @@ class App:
         if self._link.content != link:
             self._link.content = link
 
-    def _show_felt(self) -> None:
-        felt = self.readout.table(self._shown())
-        if self.session.values["arm_actions"]:
-            felt += "\n\nThe policy moves the arms, too. Untick *policy moves arms* to feel the law alone."
-        self._felt.content = felt
-
     def _add_tabs(self) -> None:
         gui = self.server.gui
         with self.panel.tabs.add_tab("View"):
@@ -230,7 +224,6 @@ class App:
             add_tour(gui, self.session.controls, self.session.sides, self.panel.do)
         with plots_tab(self.server) as tab:
             self._felt = gui.add_markdown("")
-            self._live_plots = gui.add_checkbox("live", True)
         self.plots = Plots(self.server, tab, self.session.sides, self.session.dt)
 
     def _add_chooser(self) -> None:
@@ -268,6 +261,7 @@ class App:
                 setattr(scene, name, bool(event.target.value))
 
             box.on_update(update)
+        self._live_plots = gui.add_checkbox("live plots", True)
         shadows = gui.add_checkbox("shadows", False, hint="slow in a browser without a GPU")
 
         async def cast(event: viser.GuiEvent[Any]) -> None:

@@ -168,7 +168,10 @@ class Panel:
             for side in self._sides:
                 for axis in AXES:
                     self.bind(f"held.{side}.{axis}")
-        self._gui.add_markdown("Drag an orange ball with the mouse: a spring pulls that hand after it.")
+        self._gui.add_markdown(
+            "Drag an orange ball with the mouse: a spring pulls that hand after it. Untick *policy moves arms* to feel "
+            "the law alone."
+        )
 
     def _push(self, direction: tuple[float, float, float]) -> Push:
         x, y, z = (self._good["push.force"] * d for d in direction)
