@@ -64,7 +64,7 @@ def main() -> int:
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rooms", nargs="+", choices=ROOMS, default=list(ROOMS), metavar="ROOM", help=", ".join(ROOMS))
-    parser.add_argument("--sample", type=int, default=60, metavar="N", help="places per room (default: %(default)s)")
+    parser.add_argument("--sample", type=int, default=100, metavar="N", help="places per room (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="of the sample (default: %(default)s)")
     parser.add_argument("--all", action="store_true", help="every mutant of every place")
     parser.add_argument("--again", action="store_true", help="only those that survived last time")

@@ -71,6 +71,7 @@ def test_trials_that_fell_are_in_no_figure_of_the_hand(spec: RobotSpec, part: Ca
             for name, value in arm.items():
                 assert two["arms"][side][name] == pytest.approx(value, rel=1e-5, abs=1e-7)
         assert one["arms"]["left"]["hand_swing_m"] == pytest.approx(0.05, rel=1e-3)
+        assert [arm["elbow_torque_nm"] for arm in one["arms"].values()] == pytest.approx([6.0, 6.0], rel=1e-3)
         assert none["arms"]["left"]["hand_swing_m"] is None
     assert two["falls"] == none["falls"] == 1
 
@@ -108,9 +109,8 @@ def stand(spec: RobotSpec, falls: bool) -> Trial:
         row = {name: torch.zeros(1) for name in ("height", "height_command", "path_error")}
         row |= {name: torch.zeros(1, dtype=torch.bool) for name in ("stand", "arm_at_limit")}
         row |= {name: torch.zeros(1, 3) for name in ("velocity", "command")}
-        row |= {
-            name: torch.zeros(1, joints) for name in ("arm_error", "arm_velocity", "arm_torque", "arm_static_torque")
-        }
+        row |= {name: torch.zeros(1, joints) for name in ("arm_error", "arm_velocity", "arm_static_torque")}
+        row["arm_torque"] = torch.full((1, joints), 6.0 * math.sin(2.0 * math.pi * 0.02 * k / 4.0))
         row |= {name: torch.zeros(1, 2) for name in ("position", "foot_speed", "foot_height")}
         row |= {"foot_contact": torch.ones(1, 2, dtype=torch.bool), "fell": torch.tensor([down])}
         trial.rows.append(row | {"hand_offset": offset, "hand_error": offset.norm(dim=2)})
