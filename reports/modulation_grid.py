@@ -49,7 +49,7 @@ class Options:
     seed: int = 0
     """Of the grid; the comparison has the next one."""
     threads: int = 0
-    """Processor threads; 0 takes every processor."""
+    """CPU threads; 0 takes every CPU."""
     output: str = "runs/modulation_grid"
     """Folder of what is written."""
 
