@@ -7,6 +7,7 @@ from operator import attrgetter
 from typing import Any
 
 import pytest
+import torch
 
 from cotap.configs import BASE_RECIPES, DISTILL_RECIPES, BaseTraining, DistillTraining, from_plain, to_plain
 from cotap.envs import HumanoidEnv
@@ -180,7 +181,7 @@ def test_every_recipe_makes_an_environment(name: str):
     cfg = every()[name].env
     cfg.num_envs, cfg.num_threads = 2, 1
     env = HumanoidEnv(cfg)
-    env.step(env.actuation.current * 0.0)
+    env.step(torch.zeros(2, env.num_actions))
 
 
 @pytest.mark.parametrize("name", DISTILL_RECIPES)
@@ -201,3 +202,18 @@ def test_a_distillation_begins_with_what_its_base_ended_with():
     assert env.forces.pushes.enabled
     assert env.forces.pushes.ramp.share(0.0) == env.forces.hand_loads.ramp.share(0.0) == 1.0
     assert training.ppo.initial_std == training.ppo.least_std
+
+
+def test_a_modulated_policy_begins_in_the_middle_and_is_paid_for_the_task():
+    """60 M samples; what does not give way to a push, or draws what the policy sets, is off."""
+    training = DISTILL_RECIPES["modulated"](BASE_RECIPES["default"]())
+    env, ppo = training.env, training.ppo
+    assert training.runner.iterations * ppo.steps * env.num_envs == pytest.approx(60e6, rel=1e-3)
+    laws = env.upper_body
+    assert (laws.modulation.kind, laws.left.alpha, laws.right.alpha) == ("stiffness", 0.5, 0.5)
+    assert not laws.sampling.enabled
+    weights = env.rewards.upper
+    assert max(weights.free_hand_error, weights.loaded_hand_error, weights.push_resistance) < 0.0
+    assert weights.track_arms == weights.track_key_points == 0.0
+    assert env.forces.hand_loads.enabled
+    assert env.forces.pushes.enabled

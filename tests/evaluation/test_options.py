@@ -45,6 +45,7 @@ WITHOUT: dict[str, set[str]] = {
     "passivity": {"library", "arm_pose", "hand"},  # draws its poses; pulls the left hand
     "static-stiffness": {"library"},  # holds one pose
     "fidelity": {"arm_pose"},  # draws its poses from a library
+    "task": {*ON_LEGS, "hand"},  # draws its commands, loads and pushes
     "tour": {*ON_LEGS, "arm_pose", "library", "hand"},  # walks, its arms wander, any joint is struck
 }
 """What a protocol cannot have."""
@@ -202,6 +203,7 @@ def test_the_law_of_the_training_is_the_default_of_every_evaluation(protocol, di
         "fidelity": ("cotap", "cotap"),
         "modulation": ("cotap", "cotap"),
         "passivity": ("cotap", "cotap"),
+        "task": ("cotap", "cotap"),
         "periodic-load": ("cotap", "pd"),
     }
     assert (own.left.name, own.right.name) == named.get(protocol, ("pd", "pd"))
