@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import subprocess
 import sys
@@ -17,7 +18,7 @@ from cotap.agents.actors import as_dict
 from cotap.agents.checkpoint import CheckpointError, load_checkpoint, save_checkpoint, sha256
 from cotap.configs import BASE_RECIPES, DISTILL_RECIPES
 from cotap.deployment import graph as graph_module
-from cotap.deployment.controller import law_config, termination_config
+from cotap.deployment.controller import law_config, robot_of, termination_config
 from cotap.deployment.graph import export_policy
 from cotap.deployment.metadata import PolicyError
 from cotap.deployment.policy import OnnxPolicy
@@ -147,6 +148,30 @@ def test_the_golden_moment_is_one_that_a_robot_can_be_in(policy, spec):
         assert np.min(values) < 0.0 < np.max(values)
     assert np.linalg.norm(readings["gravity"]) == pytest.approx(1.0, abs=1e-9)
     assert readings["gravity"][2] < 0.0
+
+
+@pytest.mark.parametrize(("kind", "each"), [("alpha", 1), ("stiffness", 4)])
+def test_a_policy_that_sets_the_laws_says_what_it_asks_of_them(kind, each, random_checkpoint, random_policy):
+    """Alpha, and the logarithm of stiffness, as the law's own config and the scales of the actions have it."""
+    made = {"output_gain": 1.0, "modulation": kind}
+    policy, model = OnnxPolicy(random_policy(**made)), load_policy(random_checkpoint(**made))
+    m, laws = policy.metadata, model.env_config.upper_body
+    assert robot_of(m).name == "h1"
+    assert [name.split()[0] for name in m.law_targets] == ["left"] * each + ["right"] * each
+    assert law_config(m).modulation == laws.modulation
+    out = policy(np.array(m.golden["observation"]))
+    np.testing.assert_allclose(out, [*m.golden["joint_targets"], *m.golden["law_targets"]], atol=1e-5)
+    action = model({"policy": torch.tensor([m.golden["observation"]])})[0, 19:].unflatten(0, (2, each))
+    wanted = out[19:].reshape(2, each)
+    for arm, law in enumerate((laws.left, laws.right)):
+        assert wanted[arm, 0] == pytest.approx(law.alpha + 0.5 * float(action[arm, 0]), abs=1e-5)
+        assert wanted[arm, 1:] == pytest.approx(
+            [math.log(k) + float(a) for k, a in zip(law.stiffness, action[arm, 1:], strict=False)], abs=1e-5
+        )
+    assert float(action.abs().max()) > 0.02
+    about = m.observation["about"]
+    assert about["law_alpha"]["range"] == [0.0, 1.0]
+    assert ("law_log_stiffness" in about) == (kind == "stiffness")
 
 
 def test_a_distilled_policy_says_in_which_ranges_its_law_was_trained(spec):
@@ -293,6 +318,8 @@ def test_metadata_of_another_kind_is_named(name, value, message, policy_file, tm
         ("action", {"scale_rad": [0.1]}, "action.scale_rad has 1 entries for 19 joints"),
         ("action", {"clip": -1.0}, "metadata action.clip must lie in"),
         ("action", {"upper_mode": "sideways"}, "action.upper_mode 'sideways' is unknown"),
+        ("action", {"law_targets": [3]}, "metadata action.law_targets must be a list of texts"),
+        ("action", {"law_targets": ["left alpha"]}, "golden.law_targets must be a list, got None"),
         ("action", {"upper_mode": ["residual"]}, "action.upper_mode .* is unknown"),
     ],
 )
