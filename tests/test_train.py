@@ -623,7 +623,7 @@ def test_without_a_stage_both_run_and_are_summed_up(tmp_path: Path, monkeypatch:
     )  # beforehand, 24 steps an iteration
     assert "| base | 2 | 96 |" in said
     assert "| distill | 1 | 48 |" in said
-    assert f"cotap.play --checkpoint {out / 'distill' / 'checkpoint_000001.pt'}" in said
+    assert f"cotap play --checkpoint {out / 'distill' / 'checkpoint_000001.pt'}" in said
 
 
 def test_the_quick_pipeline_is_a_small_version_of_both(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -93,6 +93,7 @@ def test_key_velocity_term_is_of_world_velocities(make_env, robot):
     record = env.record
     got = UpperRewards.TERMS["track_key_velocities"].function(record)
     assert float(record.state.torso_angular_velocity_t.norm(dim=1).min()) > 0.5
+    differs = []
     for i in range(3):
         model, data = mujoco_of(env, i)
         error = []
@@ -103,7 +104,8 @@ def test_key_velocity_term_is_of_world_velocities(make_env, robot):
         squared = (((error[0] - error[1]) / (2 * EPS)) ** 2).sum()
         assert -np.log(float(got[i])) == pytest.approx(squared, rel=5e-3)
         without_spin = (record.key_velocities_t[i] - record.key_velocities_reference_t[i]).square().sum()
-        assert abs(float(without_spin) / squared - 1.0) > 0.01  # which is not the same
+        differs.append(abs(float(without_spin) / squared - 1.0))
+    assert max(differs) > 0.02  # a torso that does not turn would have another term
 
 
 def test_joint_accelerations_are_the_change_of_velocity(make_env, robot):

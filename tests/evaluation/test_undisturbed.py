@@ -38,8 +38,8 @@ def test_a_protocol_is_the_same_whatever_the_training_had_on(protocol):
 @pytest.mark.parametrize("name", PROTOCOLS)
 def test_what_a_protocol_asks_for_is_there(name):
     cfg = PROTOCOLS[name]().configure(lively())
-    assert any(cfg.forces.scripted.force) == (name not in ("velocity-tracking", "modulation", "tour"))
+    assert any(cfg.forces.scripted.force) == (name not in ("velocity-tracking", "modulation", "task", "tour"))
     assert (cfg.forces.punches.force_n > 0.0) == (name == "tour")
     undisturbed = ("static-stiffness", "fidelity", "stability", "passivity", "tour")
     assert cfg.randomization.enabled == (name not in undisturbed)
-    assert not any(source.enabled for source in (cfg.forces.pushes, cfg.forces.hand_loads))
+    assert any(source.enabled for source in (cfg.forces.pushes, cfg.forces.hand_loads)) == (name == "task")
