@@ -362,6 +362,16 @@ def test_the_level_of_the_stores_is_reported(policy_file, tmp_path):
     assert (laws["left"]["passive"], laws["right"]["passive"]) == (True, False)
 
 
+@pytest.mark.parametrize(("given", "held"), [([], False), (["--left", "cotap:alpha=0.2"], True)])
+def test_a_law_that_is_given_is_not_set_by_the_policy(given, held, random_policy, tmp_path):
+    out, path = tmp_path / "r.json", random_policy(output_gain=1.0, modulation="stiffness")
+    args = ["--policy", str(path), *given, "--episode-seconds", "0.4", "--json", str(out), "--timestep", "0.01"]
+    assert deploy(args) == 0
+    laws = json.loads(out.read_text())["settings"]["laws"]
+    assert laws["modulation"]["held"] == held
+    assert laws["left"]["alpha"] == (0.2 if held else 0.4)
+
+
 @pytest.mark.parametrize("engine", ["mujoco", "pybullet"])
 def test_every_robot_is_deployed(robot, engine, random_policy, tmp_path):
     if engine == "pybullet":
