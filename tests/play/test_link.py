@@ -12,7 +12,7 @@ from cotap.play.guard import _SETTINGS
 from cotap.play.link import from_text, to_text
 
 NAMES = {
-    "checkpoints": ("shipped h1-base", "/home/me/a~b%20&websocket=ws:,x.pt", "c\u00e4"),
+    "checkpoints": ("shipped h1-base", "runs/a~b%20&websocket=ws:,x.pt", "c\u00e4"),
     "motions": ("rest", "a,b:c"),
 }
 
