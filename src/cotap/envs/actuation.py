@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 
+from cotap.compliance.laws import LawConfig
 from cotap.envs.randomization import Randomizer
 from cotap.envs.state import RobotState
 from cotap.envs.upper_body import UpperBody
@@ -105,6 +106,21 @@ class Actuation(Stateful):
         """Torque (N, U) that the arms' laws ask for, gains as randomised."""
         scales = self._randomizer.kp_scale[:, self._arms], self._randomizer.kd_scale[:, self._arms]
         return self.upper_body.torque(q, dq, arrived, *scales)
+
+    def set_law(self, env: int, arm: int, law: LawConfig) -> None:
+        """Put one arm of one env under another law, from the next step on. Raises ValueError as `law.check` does."""
+        ruled = self.upper_body.active
+        self.upper_body.set_law(env, arm, law)
+        if ruled and not self.upper_body.active:  # actuators are the arms' own PD again
+            self._randomizer.write_gains(torch.ones_like(self.delay_s, dtype=torch.bool))
+            self.refresh_gains()
+
+    def arm_stiffness(self) -> torch.Tensor:
+        """Joint stiffness of the arms under the laws in force, (N, A, n, n) [Nm/rad]."""
+        if self.upper_body.active:
+            return self.upper_body.stiffness
+        own = self._randomizer.gains()[0][:, self._arms]
+        return torch.diag_embed(own.reshape(self.upper_body.stiffness.shape[:3]))
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take over what `state_dict` returned. Raises ValueError for another size or a missing name."""

@@ -97,6 +97,9 @@ class HumanoidEnv(VecEnv):
         self.forces = ExternalForces(cfg.forces, spec, model, self.reader, self.arm_limits, n, dt)
         self.randomizer = Randomizer(cfg.randomization, spec, self.sim)
         self.upper_body = UpperBody(cfg.upper_body, spec, n, dt)
+        whole = torch.full((self._num_joints,), cfg.actions.clip)
+        modulated = self.upper_body.modulation.action_bounds
+        self._action_bounds = [torch.cat((side * whole, own)) for side, own in zip((-1.0, 1.0), modulated, strict=True)]
         self.actuation = Actuation(spec, self.sim, self.randomizer, self.upper_body, limit)
         self.observer = Observer(cfg.observations, spec, n, cfg.upper_body.modulation)
         self.recorder = Recorder(spec, self.reader, n, dt, cfg.gait.period_s)
@@ -170,7 +173,7 @@ class HumanoidEnv(VecEnv):
         """
         require_shape("actions", actions, (self.num_envs, self.num_actions))
         require_all_finite("actions", actions)
-        action = self._clipped(actions)
+        action = actions.clamp(*self._action_bounds)
         velocity_before = self.state.joint_vel
         self._act(action)
         self.sim.step(self.actuation.drive)
@@ -200,21 +203,12 @@ class HumanoidEnv(VecEnv):
         extras = {"time_outs": time_out, "falls": fell, "group_rewards": rewards, "log": log}
         return self._observe(done), rewards.sum(1), done, extras
 
-    def _clipped(self, actions: torch.Tensor) -> torch.Tensor:
-        """What of actions (N, J + M) counts."""
-        clipped = actions.clamp(-self.cfg.actions.clip, self.cfg.actions.clip)
-        if self.num_actions == self._num_joints:
-            return clipped
-        joints, laws = clipped.tensor_split((self._num_joints,), 1)
-        return torch.cat((joints, self.upper_body.modulation.bounded(laws)), 1)
-
     def _act(self, action: torch.Tensor) -> None:
         """Send targets and set forces. The reference moves first: arms are sent where it will be at the step's end."""
         self.motions.step(self.rng)
         reference = self.motions.current()
         joints, laws = action.tensor_split((self._num_joints,), 1)
-        if (modulation := self.upper_body.modulation).active:
-            modulation.approach(self.upper_body.parameters, modulation.wanted(laws))
+        self.upper_body.modulate(laws)
         self.actuation.send(self.state, self.joint_targets(joints, reference.position), reference.velocity)
         xfrc = self.sim.xfrc
         self.forces.apply(xfrc, self.state, self.dt * self.episode_length_buf, self.samples)
@@ -240,7 +234,7 @@ class HumanoidEnv(VecEnv):
         totals: list[torch.Tensor] = []
         for group in self._groups:
             total, terms = group(self.record)
-            totals.append(torch.where(bad, 0.0, total))
+            totals.append(total)
             means = terms[:, ok].mean(1).nan_to_num(0.0)  # none are left where all have diverged
             log.update({f"/{group.name}/{name}": mean for name, mean in zip(group.terms, means.unbind(), strict=True)})
         if self.upper_body.active:
@@ -248,7 +242,7 @@ class HumanoidEnv(VecEnv):
             log |= self.upper_body.log | {"/law/saturated": at_limit[:, self.num_lower :].float().mean()}
         log["/episode/diverged"] = torch.tensor(float(self.num_diverged))
         log["/curriculum/assist"] = torch.tensor(self.cfg.assist.share(self.samples))
-        return torch.stack(totals, 1), log
+        return torch.stack(totals, 1).masked_fill(bad.unsqueeze(1), 0.0), log
 
     def _restart(self, mask: torch.Tensor, start: tuple[torch.Tensor, torch.Tensor] | None = None) -> None:
         """Begin new episodes in the n envs of `mask` (N,), from `qpos` (n, 7 + J) and `qvel` (n, 6 + J) if given."""
@@ -294,17 +288,11 @@ class HumanoidEnv(VecEnv):
 
     def set_law(self, env: int, arm: int, law: LawConfig) -> None:
         """Put one arm of one env under another law, from the next step on. Raises ValueError as `law.check` does."""
-        ruled = self.upper_body.active
-        self.upper_body.set_law(env, arm, law)
-        if ruled and not self.upper_body.active:  # actuators are the arms' own PD again
-            self.randomizer.write_gains(torch.ones(self.num_envs, dtype=torch.bool, device=self.device))
-            self.actuation.refresh_gains()
+        self.actuation.set_law(env, arm, law)
 
     def arm_stiffness(self) -> torch.Tensor:
         """Joint stiffness of the arms under the laws in force, (N, A, n, n) [Nm/rad]."""
-        if self.upper_body.active:
-            return self.upper_body.stiffness
-        return torch.diag_embed(self.reader.arm_joints(self.randomizer.gains()[0]))
+        return self.actuation.arm_stiffness()
 
     def state_dict(self) -> dict[str, Any]:
         """All that the environment's future depends on, on the CPU whatever the device."""

@@ -126,9 +126,10 @@ class Modulation:
         """What actions (N, M) ask for, within the bounds (N, M)."""
         return (self._zero + self._scale * action).clamp(self._low, self._high)
 
-    def bounded(self, action: torch.Tensor) -> torch.Tensor:
-        """Actions (N, M) without what lies beyond the bounds and so does nothing."""
-        return action.clamp((self._low - self._zero) / self._scale, (self._high - self._zero) / self._scale)
+    @property
+    def action_bounds(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Lowest and highest action (M,): what lies beyond them does nothing."""
+        return (self._low - self._zero) / self._scale, (self._high - self._zero) / self._scale
 
     def approach(self, parameters: LawParameters, wanted: torch.Tensor) -> None:
         """While `active`, bring `parameters` closer to what is `wanted` (N, M), as far as a control step allows."""

@@ -184,6 +184,11 @@ class UpperBody(Stateful):
             self._hold_s = self._hold_s - dt
             self._sample(self._hold_s <= 0.0, rng)
 
+    def modulate(self, action: torch.Tensor) -> None:
+        """With learned modulation, bring the parameters closer to what actions (N, M) ask for."""
+        if self.modulation.active:
+            self.modulation.approach(self.parameters, self.modulation.wanted(action))
+
     def _sample(self, mask: torch.Tensor, rng: torch.Generator) -> None:
         n, arms = int(mask.sum()), self._shape[1]
         if n == 0:
