@@ -210,6 +210,27 @@ def test_the_fast_blend_of_different_gains_is_the_geodesic_from_pd(joints: int, 
     torch.testing.assert_close(alike.stiffness, known.stiffness, rtol=1e-5, atol=1e-4)
 
 
+def test_without_the_ratio_it_is_the_papers_law_up_to_a_straight_arm(rng):
+    """Equation 7 with the exact pseudo-inverse at alpha 1; the damped law adds stiffness where rank is nearly lost."""
+    j = random_jacobians(rng, 4000, largest_condition=1e3)
+    j = j[condition_number(j) > 60.0]
+    assert len(j) > 500
+    task, null, pd = torch.full((len(j), 3), 300.0), torch.full((len(j),), 40.0), torch.full((len(j),), 100.0)
+    blend = blended_stiffness(j.float(), task, null, pd, torch.ones(len(j)), math.inf)
+    exact = j.float().double()
+    inverse = torch.linalg.pinv(exact)
+    eye = torch.eye(4, dtype=DOUBLE)
+    literal = exact.mT @ (300.0 * exact) + 40.0 * (eye - inverse @ exact)
+    torch.testing.assert_close(blend.stiffness.double(), literal, rtol=1e-4, atol=1e-3)
+    torch.testing.assert_close(blend.ratio, torch.ones(len(j)))
+    damped = blended_stiffness(j.float(), task, null, pd, torch.ones(len(j)), 1e9).stiffness.double()
+    assert float(torch.linalg.eigvalsh(damped - literal)[:, -1].min()) > 1.0
+    straight = torch.tensor([[0.0, 0.3, 0.0, 0.1], [0.2, 0.0, 0.4, 0.0], [0.0, 0.0, 0.0, 0.0]])
+    stiffness = blended_stiffness(straight, task[0], null[0], pd[0], torch.tensor(1.0), math.inf)
+    assert torch.isfinite(stiffness.stiffness).all()
+    assert torch.isfinite(stiffness.pseudo_inverse).all()
+
+
 @pytest.mark.parametrize("apart", [0.0, 2e-7, 1e-5, 0.03])
 def test_the_fast_blend_is_as_exact_where_eigenvalues_nearly_coincide(apart: float):
     """Of a Jacobian that is diagonal, so is the blend: `pd^(1-a) k^a` joint by joint."""

@@ -63,7 +63,7 @@ def test_without_the_ratio_alpha_alone_says_how_stiff_arms_are(make_env):
     env = make_env(2, upper_body=UpperBodyConfig(law, law, singularity_ratio=False))
     with_ratio = make_env(2, upper_body=UpperBodyConfig(law, law))
     for e in (env, with_ratio):
-        e.sim.qpos[:, 7 + 14] = e.sim.qpos[:, 7 + 18] = 1.45
+        e.sim.qpos[:, 7 + 14] = e.sim.qpos[:, 7 + 18] = 1.4
         e.state = e.reader.read()
         e.upper_body.send(e.state, e.actuation.current[:, 11:], e.motions.current().velocity)
     s = env.state
@@ -85,7 +85,7 @@ def test_the_threshold_of_the_ratio_is_the_laws_own(make_env):
         UpperBodyConfig(far, far, singularity_ratio=False),
     ):
         env = make_env(1, upper_body=cfg)
-        env.sim.qpos[:, 7 + 14] = env.sim.qpos[:, 7 + 18] = 1.45
+        env.sim.qpos[:, 7 + 14] = env.sim.qpos[:, 7 + 18] = 1.4
         env.state = env.reader.read()
         env.upper_body.send(env.state, env.actuation.current[:, 11:], env.motions.current().velocity)
         stiffness.append(env.upper_body.stiffness[0])

@@ -14,6 +14,7 @@ differentiated: where eigenvalues coincide, the result is not finite.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -31,7 +32,8 @@ class ArmStiffness:
     stiffness: torch.Tensor
     """(..., n, n) the blend K [Nm/rad]."""
     pseudo_inverse: torch.Tensor
-    """(..., n, 3) J#, damped near rank loss; of all that reach the hand's target, what the PD gains resist least."""
+    """(..., n, 3) J#, damped near rank loss unless the threshold is infinite; of all that reach the hand's target,
+    what the PD gains resist least."""
     null_projector: torch.Tensor
     """(..., n, n) I - J# J."""
     ratio: torch.Tensor
@@ -101,21 +103,25 @@ def blended_stiffness(
             gains are [Nm/rad].
         pd_stiffness: The PD law's gains: (...) where they are the same on all joints of an arm, else (..., n) [Nm/rad].
         alpha: (...) in [0, 1].
-        threshold: Condition number up to which alpha is kept.
+        threshold: Condition number up to which alpha is kept. If it is infinite, alpha is kept everywhere and lost rank
+            is not made up for: the paper's law without its ratio.
     """
     j = jacobian.double()
+    tolerance = 0.0 if math.isinf(threshold) else RANK_TOLERANCE
     squares = eigenvalues_3x3(j @ j.transpose(-1, -2))
     singularity = 1.0 / (1.0 + (_condition(squares) - threshold).clamp_min(0.0))
     ratio = alpha.double() * singularity
     if pd_stiffness.dim() < jacobian.dim() - 1:
         return _in_one_gain(
-            j, squares, task_stiffness, null_stiffness, pd_stiffness, ratio, singularity, jacobian.dtype
+            j, squares, task_stiffness, null_stiffness, pd_stiffness, ratio, singularity, tolerance, jacobian.dtype
         )
     largest = pd_stiffness.double().amax(-1)
     root = (pd_stiffness.double() / largest.unsqueeze(-1)).sqrt()
     j = j / root.unsqueeze(-2)
     squares = eigenvalues_3x3(j @ j.transpose(-1, -2))
-    blend = _in_one_gain(j, squares, task_stiffness, null_stiffness, largest, ratio, singularity, jacobian.dtype)
+    blend = _in_one_gain(
+        j, squares, task_stiffness, null_stiffness, largest, ratio, singularity, tolerance, jacobian.dtype
+    )
     rows, columns = root.to(jacobian.dtype).unsqueeze(-1), root.to(jacobian.dtype).unsqueeze(-2)
     return replace(
         blend, stiffness=rows * blend.stiffness * columns, pseudo_inverse=blend.pseudo_inverse / rows,
@@ -131,15 +137,16 @@ def _condition(squares: torch.Tensor) -> torch.Tensor:
 
 def _in_one_gain(
     j: torch.Tensor, squares: torch.Tensor, task_stiffness: torch.Tensor, null_stiffness: torch.Tensor,
-    pd_stiffness: torch.Tensor, ratio: torch.Tensor, singularity: torch.Tensor, kind: torch.dtype,
+    pd_stiffness: torch.Tensor, ratio: torch.Tensor, singularity: torch.Tensor, tolerance: float,
+    kind: torch.dtype,
 ) -> ArmStiffness:  # fmt: skip
     """`blended_stiffness` for one gain (...), of a Jacobian in float64 and its squared singular values."""
     gram = j @ j.transpose(-1, -2)
     largest = squares[..., 2].clamp_min(1e-12)
-    missing = (RANK_TOLERANCE**2 * largest - squares[..., 0]).clamp_min(0.0)
+    missing = (tolerance**2 * largest - squares[..., 0]).clamp_min(0.0)
     eye = torch.eye(j.shape[-1], dtype=j.dtype, device=j.device)
     transposed = j.transpose(-1, -2)
-    pseudo_inverse = transposed @ inverse_3x3(_plus(gram, missing))
+    pseudo_inverse = transposed @ inverse_3x3(_plus(gram, missing.maximum(_ROUNDING * largest)))
     # The projector itself is as exact as doubles allow: the rank that is lost is made up for in the power below.
     null_projector = eye - transposed @ inverse_3x3(_plus(gram, _ROUNDING * largest)) @ j
     if task_stiffness.dim() == j.dim():

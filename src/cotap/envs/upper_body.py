@@ -79,7 +79,8 @@ class UpperBodyConfig:
     sampling: LawSampling = field(default_factory=LawSampling)
     modulation: ModulationConfig = field(default_factory=ModulationConfig)
     singularity_ratio: bool = True
-    """Whether compliance gives way to PD near singular arms (paper, equation 9); False for its ablation."""
+    """Whether compliance gives way to PD near singular arms (paper, equation 9); False for its ablation, the paper's
+    law without it."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
@@ -94,7 +95,8 @@ class UpperBodyConfig:
         return {"left": self.left, "right": self.right}[side]
 
     def built(self, law: LawConfig) -> LawConfig:
-        """`law` as it is built here: without the ratio, no arm is near enough to singular to give way."""
+        """`law` as it is built here: without the ratio, no arm is near enough to singular to give way, or to be damped
+        there."""
         return law if self.singularity_ratio else replace(law, condition_threshold=math.inf)
 
 
