@@ -107,9 +107,12 @@ def stand(spec: RobotSpec, falls: bool) -> Trial:
         offset = torch.zeros(1, arms, 3, dtype=torch.float64)
         offset[..., 2] = -1.0 if down else height
         row = {name: torch.zeros(1) for name in ("height", "height_command", "path_error")}
-        row |= {name: torch.zeros(1, dtype=torch.bool) for name in ("stand", "arm_at_limit")}
+        row["stand"] = torch.zeros(1, dtype=torch.bool)
         row |= {name: torch.zeros(1, 3) for name in ("velocity", "command")}
-        row |= {name: torch.zeros(1, joints) for name in ("arm_error", "arm_velocity", "arm_static_torque")}
+        row |= {
+            name: torch.zeros(1, joints)
+            for name in ("arm_error", "arm_velocity", "arm_torque_share", "arm_static_torque")
+        }
         row["arm_torque"] = torch.full((1, joints), 6.0 * math.sin(2.0 * math.pi * 0.02 * k / 4.0))
         row |= {name: torch.zeros(1, 2) for name in ("position", "foot_speed", "foot_height")}
         row |= {"foot_contact": torch.ones(1, 2, dtype=torch.bool), "fell": torch.tensor([down])}

@@ -17,6 +17,7 @@ from cotap.evaluation.disturbance import (
     Impact,
     curve,
     falls_by_time,
+    impedance_error,
     load_overshoot,
     recovery,
     response_measures,
@@ -40,10 +41,12 @@ def test_measures_by_hand():
     t.arm_torque[inside, 0, 0], t.arm_torque[inside, 0, 1] = 3.0, -4.0
     t.arm_velocity[inside, 0, :2] = 0.5
     t.arm_error[inside, 0, 2] = 0.25
-    t.arm_at_limit[60:70, 0] = True
+    t.arm_torque_share[60:80, 0, :2] = 0.95
+    t.arm_torque_share[60:70, 0, 5] = 1.0
     m = window_measures(t, 50, 100, LEFT)
     expected = {"e_torso": 0.5, "e_ee": 0.15, "e_ee_hit": 0.2, "j_upper": 5.0, "e_upper": 0.25, "peak_torque": 4.0,
-                "share_at_limit": 0.2, "energy": 3.5, "fall_fraction": 0.0}  # fmt: skip
+                "share_at_limit": 0.2, "near_limit_share": (20 * 2 + 10) / (50 * 8), "energy": 3.5,
+                "fall_fraction": 0.0}  # fmt: skip
     for name, value in expected.items():
         assert float(m[name][0]) == pytest.approx(value, abs=1e-5), name
         assert float(m[name][1]) == pytest.approx(0.0, abs=1e-5), name
@@ -101,6 +104,15 @@ def test_displacement_is_what_the_load_adds():
     assert float(m["displacement_z"][0]) == pytest.approx(-0.05)
     assert float(m["displacement_x"][0]) == 0.0
     assert m["displacement_z"][1].isnan()
+
+
+def test_impedance_error_is_the_distance_from_a_springs_displacement():
+    """-15 N at 300 N/m is 5 cm down; the hand is 2 cm short of it and 1.5 cm to the side."""
+    moved = {"displacement_x": torch.tensor([0.0, math.nan]), "displacement_y": torch.tensor([0.015, 0.0]),
+             "displacement_z": torch.tensor([-0.03, 0.0])}  # fmt: skip
+    error = impedance_error(moved, (0.0, 0.0, -15.0), (100.0, 200.0, 300.0))
+    assert float(error[0]) == pytest.approx(0.025)
+    assert error[1].isnan()
 
 
 def test_a_load_overshoots_by_what_it_carries_the_hand_beyond_its_rest():
@@ -258,9 +270,25 @@ def test_the_command_writes_what_was_asked_for(protocol, checkpoint, tmp_path, c
     assert result["arms"] == ("moving" if protocol == "impact" else "held")
     assert (tmp_path / "plot.png").stat().st_size > 5000
     assert result["metrics"]["j_upper_blow"]["n"] == 16
-    assert ("load_overshoot" in result["metrics"]) == (protocol == "constant-load")
+    for of_loads in ("load_overshoot", "impedance_error"):
+        assert (of_loads in result["metrics"]) == (protocol == "constant-load")
     assert "per_env" not in result
     assert "| e_ee_hit |" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("method", "measured"), [("pd", False), ("cotap", True)])
+def test_a_held_hand_gives_way_as_the_stiffness_says(method, measured, tmp_path):
+    """10 N at 500 N/m is 2 cm; the task error makes that exact, and PD commands no stiffness."""
+    law = ["--stiffness", "500", "--error", "task"] if measured else []
+    out = tmp_path / "out.json"
+    arguments = ["--method", method, *law, "--pelvis", "fixed", "--force", "0", "0", "-10", "--num-envs", "2",
+                 "--no-randomize", "--threads", "1", "--json", str(out)]  # fmt: skip
+    assert main(["constant-load", *arguments]) == 0
+    metrics = json.loads(out.read_text())["metrics"]
+    assert ("impedance_error" in metrics) == measured
+    if measured:
+        assert metrics["impedance_error"]["mean"] < 5e-4
+        assert metrics["displacement_z"]["mean"] == pytest.approx(-0.02, abs=5e-4)
 
 
 def test_the_blow_itself_is_the_first_tenth_of_a_second():

@@ -136,7 +136,7 @@ def _row(
         "arm_error": s.joint_pos[:, first:] - reference,
         "arm_velocity": s.joint_vel[:, first:],
         "arm_torque": torque[:, first:],
-        "arm_at_limit": (torque[:, first:].abs() > 0.999 * limit).any(1),
+        "arm_torque_share": torque[:, first:].abs() / limit,
         "arm_static_torque": arm_static_torque(controller.upper_body.arms, s, force_w),
         "hand_offset": offset_t @ (s.heading_w.transpose(1, 2) @ s.torso_rotation_w).transpose(1, 2),
         "hand_error": offset_t.norm(dim=2),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,8 @@ BEFORE_S = 0.5
 """What a hand does in this time before the onset is what it is compared with afterwards [s]."""
 PUSH_S = 0.1
 """The time from the onset in which an arm takes a push [s]."""
+NEAR_LIMIT = 0.9
+"""Share of its torque limit from which a joint counts as near it."""
 LEAST_WAY_M = 0.005
 """A load that moves the hand less than this has no overshoot beside its sway [m]."""
 
@@ -105,6 +108,8 @@ class Impact(Scenario):
             window |= transient_measures(t, onset, release, end, hit, BEFORE_S)
         elif any(self.force) and self.place == "hand":
             window["load_overshoot"] = load_overshoot(t, onset, begin, end, hit)
+        if not self._without_load() and (commanded := self._commanded(env)):
+            window["impedance_error"] = impedance_error(window, self.force, commanded)
         fall_end = onset + round(self.fall_seconds / t.dt)
         window["fall_fraction"] = t.fell[:fall_end].any(0)
         episode = window_measures(t, 0, len(t.fell), hit)
@@ -122,18 +127,23 @@ class Impact(Scenario):
             **({"per_env": per_env_figures(window, stood)} if self.per_env else {}),
         } | self._stiffness(env, window, stood)
 
+    def _without_load(self) -> str:
+        """Why there is no held load of one direction on a hand; empty where there is."""
+        if self.place != "hand" or not any(self.force):
+            return "no hand is loaded"
+        if self.duration < self.window[1]:
+            return "the force is over before the window is"
+        return "the force's direction differs between envs" if self.random_direction else ""
+
+    def _commanded(self, env: HumanoidEnv) -> list[float] | None:
+        """Stiffness [N/m] of the first hand that the force is on; None under a law that commands none."""
+        law = env.cfg.upper_body.of(env.spec.arms[self.hit(env)[0]].side)
+        return list(law.stiffness) if law.name not in WITHOUT_STIFFNESS else None
+
     def _stiffness(self, env: HumanoidEnv, measures: dict[str, torch.Tensor], stood: torch.Tensor) -> dict[str, Any]:
         """Force over displacement, where the load is held and is the same in all envs."""
-        law = env.cfg.upper_body.of(env.spec.arms[self.hit(env)[0]].side)
-        commanded = list(law.stiffness) if law.name not in WITHOUT_STIFFNESS else None
-        reason = ""
-        if self.place != "hand" or not any(self.force):
-            reason = "no hand is loaded"
-        elif self.duration < self.window[1]:
-            reason = "the force is over before the window is"
-        elif self.random_direction:
-            reason = "the force's direction differs between envs"
-        if reason:
+        commanded = self._commanded(env)
+        if reason := self._without_load():
             return {"effective_stiffness": {"commanded": commanded, "measured": None, "reason": reason}}
         measured: list[float | None] = []
         for force, axis in zip(self.force, "xyz", strict=True):
@@ -208,7 +218,8 @@ def window_measures(t: Trajectory, begin: int, end: int, hit: list[int]) -> dict
         "j_upper": masked_mean(torque, alive),
         "e_upper": masked_mean(part.arm_error.norm(dim=2), alive),
         "peak_torque": torch.where(seen, peak, nothing),
-        "share_at_limit": masked_mean(part.arm_at_limit.float(), alive),
+        "share_at_limit": masked_mean((part.arm_torque_share > 0.999).any(2).float(), alive),
+        "near_limit_share": masked_mean((part.arm_torque_share > NEAR_LIMIT).float().mean(2), alive),
         "energy": torch.where(seen, energy, nothing),
         "fall_fraction": t.fell[:end].any(0),
     }
@@ -242,6 +253,16 @@ def response_measures(t: Trajectory, onset: int, begin: int, end: int, hit: list
         "recovered_fraction": recovered,
         **{f"displacement_{axis}": moved[:, i] for i, axis in enumerate("xyz")},
     }
+
+
+def impedance_error(
+    displacement: dict[str, torch.Tensor], force: Sequence[float], stiffness: Sequence[float]
+) -> torch.Tensor:
+    """Distance (N,) [m] of the hand's displacement from the one that a spring of the commanded `stiffness` [N/m] gives
+    under `force` [N], x, y, z of the heading frame."""
+    expected = torch.tensor([f / k for f, k in zip(force, stiffness, strict=True)])
+    moved = torch.stack([displacement[f"displacement_{axis}"] for axis in "xyz"], 1)
+    return (moved - expected).norm(dim=1)
 
 
 def load_overshoot(t: Trajectory, onset: int, begin: int, end: int, hit: list[int]) -> torch.Tensor:

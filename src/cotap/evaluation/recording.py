@@ -18,7 +18,7 @@ from cotap.evaluation.rollout import STEPPED, Trajectory
 from cotap.files import write_arrays
 from cotap.inputs import InputError, read_arrays
 
-FORMAT, VERSION = "cotap-recording", 3
+FORMAT, VERSION = "cotap-recording", 4
 SCENE: dict[str, tuple[str | int, ...]] = {
     "qpos": ("Q",), "hand_w": ("H", 3), "hand_reference_w": ("H", 3), "hand_force_w": ("H", 3), "heading_w": (3, 3),
     "commanded_stiffness": ("H", 3), "effective_stiffness": ("H", 3, 3), "stiffness_eigenvalues": ("H", 2),
@@ -29,12 +29,12 @@ OF_SOME_LAWS = ("commanded_stiffness", "store_energy", "held_back")
 """Of these, what only some laws have; NaN under the others."""
 TRAJECTORY: dict[str, tuple[str | int, ...]] = {
     "velocity": (3,), "command": (3,), "stand": (), "height": (), "height_command": (),
-    "position": (2,), "arm_error": ("U",), "arm_velocity": ("U",), "arm_torque": ("U",), "arm_at_limit": (),
+    "position": (2,), "arm_error": ("U",), "arm_velocity": ("U",), "arm_torque": ("U",), "arm_torque_share": ("U",),
     "arm_static_torque": ("U",), "hand_offset": ("H", 3), "hand_error": ("H",), "foot_contact": ("F",),
     "foot_speed": ("F",), "foot_height": ("F",), "path_error": (), "fell": (),
 }  # fmt: skip
 """The same of the trajectory."""
-EVENTS = ("stand", "arm_at_limit", "foot_contact", "fell")
+EVENTS = ("stand", "foot_contact", "fell")
 """Of these, what is true or false; all else is in single precision."""
 _LARGEST = 1e12
 """Whatever is larger was measured on no robot, and its square soon is no number."""

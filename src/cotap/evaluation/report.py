@@ -17,13 +17,14 @@ UNITS = {
     "e_torso": "m/s", "e_torso_x": "m/s", "e_torso_y": "m/s", "e_ee_hit": "m", "peak_torque": "Nm",
     "energy": "J", "recovery_s": "s", "settle_s": "s", "transient_energy": "J/kg", "oscillation_energy": "J/kg",
     "displacement_x": "m", "displacement_y": "m", "displacement_z": "m",
-    "free_hand_error": "m", "loaded_hand_error": "m", "push_resistance": "N",
+    "impedance_error": "m", "free_hand_error": "m", "loaded_hand_error": "m", "push_resistance": "N",
     "survival_s": "s", "position_error": "m", "yaw_error": "rad", "vibration": "rad/s^2", "j_upper_blow": "Nm",
 }  # fmt: skip
 
 LESS_IS_BETTER = (
     "e_lin", "e_lin_gait", "e_yaw", "e_yaw_gait", "e_height", "e_upper", "e_ee", "e_ee_hit", "e_path", "e_torso",
-    "e_torso_x", "e_torso_y", "stand_drift", "foot_slip", "fall_fraction", "share_at_limit", "recovery_s", "settle_s",
+    "e_torso_x", "e_torso_y", "stand_drift", "foot_slip", "fall_fraction", "share_at_limit", "near_limit_share",
+    "impedance_error", "recovery_s", "settle_s",
     "transient_energy", "oscillation_energy", "overshoot", "overshoots", "load_overshoot", "stiffness_error",
     "position_error", "yaw_error", "vibration", "free_hand_error", "loaded_hand_error", "push_resistance",
 )  # fmt: skip

@@ -44,8 +44,8 @@ class Trajectory:
     """(T, N, U) arm joint rates [rad/s]."""
     arm_torque: torch.Tensor
     """(T, N, U) [Nm]."""
-    arm_at_limit: torch.Tensor
-    """(T, N) bool: an arm joint is at its torque limit."""
+    arm_torque_share: torch.Tensor
+    """(T, N, U) size of that torque over the joint's limit."""
     arm_static_torque: torch.Tensor
     """(T, N, U) what statics asks of the arms: nominal gravity at this pose, less what the hand's force does [Nm]."""
     hand_offset: torch.Tensor
@@ -167,7 +167,7 @@ def trajectory_row(env: HumanoidEnv, fell: torch.Tensor) -> dict[str, torch.Tens
         "arm_error": s.joint_pos[:, upper] - r.reference.position,
         "arm_velocity": s.joint_vel[:, upper],
         "arm_torque": r.torque[:, upper],
-        "arm_at_limit": (r.torque[:, upper].abs() > 0.999 * env.arm_limits.flatten()).any(1),
+        "arm_torque_share": r.torque[:, upper].abs() / env.arm_limits.flatten(),
         "arm_static_torque": arm_static_torque(env.upper_body.arms, s, env.hand_force_w),
         "hand_offset": offset_t @ (s.heading_w.transpose(1, 2) @ s.torso_rotation_w).transpose(1, 2),
         "hand_error": offset_t.norm(dim=2),
