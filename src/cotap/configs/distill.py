@@ -37,6 +37,7 @@ def default(base: BaseTraining) -> DistillTraining:
         left=LawConfig(name="cotap"), right=LawConfig(name="cotap"), sampling=LawSampling(enabled=True, full_alpha=0.25)
     )
     _after_base(training, base)
+    env.forces.pushes.hand_share, env.forces.pushes.hand_velocity = 0.5, (0.0, 0.8)  # hands are what the law is for
     env.rewards.upper.reference_closeness = 1.0
     training.runner.iterations = 6103
     return training
