@@ -635,9 +635,24 @@ def test_the_quick_pipeline_is_a_small_version_of_both(tmp_path: Path, monkeypat
         assert not newest(tmp_path / stage)["config"]["training"]["env"]["forces"]["pushes"]["enabled"]
 
 
+def test_the_pipelines_first_stage_may_have_another_recipe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    tiny_networks(monkeypatch)
+    assert run("--base-recipe", "tour", *BOTH, RUN_DIR, tmp_path) == 0
+    pushes = newest(tmp_path / "base")["config"]["training"]["env"]["forces"]["pushes"]
+    assert (pushes["link_share"], pushes["link_velocity"]) == (0.4, pushes["velocity"])
+    pushes = newest(tmp_path / "distill")["config"]["training"]["env"]["forces"]["pushes"]
+    assert pushes["hand_share"] == 0.5
+
+
 @pytest.mark.parametrize(
     ("options", "needle"),
-    [([ENVS, 0], "num_envs"), (["--base-iterations", -1], "base_iterations"), ([THREADS, -1], "threads")],
+    [
+        ([ENVS, 0], "num_envs"),
+        (["--base-iterations", -1], "base_iterations"),
+        ([THREADS, -1], "threads"),
+        (["--base-recipe", "fast"], "default, facet, paper, quick, tour"),
+        (["--quick", "--base-recipe", "tour"], "--base-recipe 'tour'"),
+    ],
 )
 def test_bad_options_of_both_stages_are_named(options: list[Any], needle: str, capsys: pytest.CaptureFixture[str]):
     assert run(*options) == 2

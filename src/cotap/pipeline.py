@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cotap.agents.checkpoint import STAGES
-from cotap.checks import require_positive_int, require_range
+from cotap.checks import require_one_of, require_positive_int, require_range
 from cotap.configs import BASE_RECIPES, DISTILL_RECIPES, BaseTraining, DistillTraining
 from cotap.sim import resolve_backend
 
@@ -27,6 +27,8 @@ class PipelineOptions:
     """Name of the robot."""
     quick: bool = False
     """A small version of both stages. Walking is trained without loads and pushes, compliance only begun."""
+    base_recipe: str = ""
+    """Recipe of stage 1. Without it, default, or quick with --quick."""
     resume: bool = False
     """Go on with the runs in --run-dir. A stage that is finished is not run again."""
     num_envs: int = 1024
@@ -52,13 +54,20 @@ class PipelineOptions:
             require_range(name, getattr(self, name), 0, 1e9)
         require_range("threads", self.threads, 0, 4096)
         resolve_backend(self.backend)
+        if self.base_recipe:
+            require_one_of("base_recipe", self.base_recipe, BASE_RECIPES.keys())
+            if self.quick:
+                raise ValueError(
+                    f"--quick has its own recipe of stage 1, so --base-recipe {self.base_recipe!r} is not allowed"
+                )
         if self.resume and not self.run_dir:
             raise ValueError("--resume goes on with the runs in --run-dir, which is not given")
 
     @property
-    def recipe(self) -> str:
-        """Of both stages."""
-        return "quick" if self.quick else "default"
+    def recipes(self) -> tuple[str, str]:
+        """Of both stages, by name."""
+        both = "quick" if self.quick else "default"
+        return self.base_recipe or both, both
 
     def iterations(self) -> tuple[int, int]:
         """Of both stages."""
@@ -67,10 +76,11 @@ class PipelineOptions:
 
     def _trainings(self) -> tuple[BaseTraining, DistillTraining]:
         """Both configurations."""
-        base = BASE_RECIPES[self.recipe]()
+        first, second = self.recipes
+        base = BASE_RECIPES[first]()
         base.env.robot, base.env.num_envs, base.env.backend = self.robot, self.num_envs, self.backend
         base.env.num_threads = self.threads
-        distill = DISTILL_RECIPES[self.recipe](base)
+        distill = DISTILL_RECIPES[second](base)
         base.runner.iterations = self.base_iterations or base.runner.iterations
         distill.runner.iterations = self.distill_iterations or distill.runner.iterations
         return base, distill
@@ -100,8 +110,11 @@ def train_both(options: PipelineOptions, run_stage: RunStage) -> Path:
     base_steps, distill_steps = options.iterations()
     if not options.resume:
         print(expected(options), flush=True)
-    base = _part(options, run_dir / "base", base_steps, ["--robot", options.robot], run_stage)
-    _part(options, run_dir / "distill", distill_steps, ["--base-checkpoint", str(base)], run_stage)
+    first, second = options.recipes
+    begin = ["--recipe", first, "--robot", options.robot]
+    base = _part(options, run_dir / "base", base_steps, begin, run_stage)
+    begin = ["--recipe", second, "--base-checkpoint", str(base)]
+    _part(options, run_dir / "distill", distill_steps, begin, run_stage)
     print(_summary(run_dir), end="")
     return run_dir
 
@@ -136,7 +149,7 @@ def _part(options: PipelineOptions, run_dir: Path, iterations: int, begin: list[
     run_stage(run_dir.name, [
         "--num-envs", str(options.num_envs), "--seed", str(options.seed), "--threads", str(options.threads),
         "--backend", options.backend, "--device", options.device, "--iterations", str(iterations),
-        "--run-dir", str(run_dir), *(["--resume", str(newest)] if newest else ["--recipe", options.recipe, *begin]),
+        "--run-dir", str(run_dir), *(["--resume", str(newest)] if newest else begin),
     ])  # fmt: skip
     newest = _newest(run_dir)
     assert newest, f"{run_dir} holds no checkpoint of a stage that ended"
