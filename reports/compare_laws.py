@@ -38,7 +38,7 @@ from cotap.evaluation.wrong_model import misjudge
 from cotap.files import write_atomically
 from cotap.robots import h1
 from reports.law_figures import draw_properties, draw_static, draw_transient
-from reports.paper_tables import PROPERTIES, STATIC
+from reports.paper.tables import PROPERTIES, STATIC
 
 LOADS_N = (10.0, 30.0, 50.0)
 ROWS: dict[str, dict[str, Any]] = {

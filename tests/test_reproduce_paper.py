@@ -1,99 +1,186 @@
-"""The page that reports.reproduce_paper writes: verdicts, missing checkpoints, numbers as they were measured."""
+"""The page that reports.reproduce_paper writes: verdicts, marks, missing checkpoints, numbers as they were measured."""
 
 from __future__ import annotations
 
 import json
-import sys
+import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 from random_policy import save_random_policy
 
 from cotap.agents.checkpoint import sha256
 from reports import reproduce_paper as rp
+from reports.paper import ablation, fidelity, relative, walking, words
+from reports.paper.arms import COMPLIANT, PD, SOFT, arms, label, mass
+from reports.paper.book import Book
+from reports.paper.tables import IMPACT, ORDERINGS
+from reports.paper.trainings import Trainings
 
 
 @pytest.fixture
-def book(tmp_path: Path) -> rp.Book:
-    policies = {"base": str(save_random_policy(tmp_path / "policy.pt"))}
-    return rp.Book(tmp_path, tmp_path, 4, 1, False, policies)
+def book(tmp_path: Path) -> Book:
+    return Book("h1", tmp_path, tmp_path / "evaluations", envs=4, threads=1)
 
 
-def measured(mean: float, half: float) -> dict:
-    summary = {"mean": mean, "std": 1.0, "ci95": [mean - half, mean + half]}
-    measures = dict.fromkeys(("j_upper", "j_upper_blow", "e_torso"), summary)
-    return {"metrics_without_falls": measures, "settings": {"seed": 0}}
+def measured(mean: float, half: float = 0.1, **others: float) -> dict[str, Any]:
+    """A result with one mean for every measure, and others for some."""
+
+    def summary(value: float) -> dict[str, Any]:
+        return {"mean": value, "std": 1.0, "ci95": [value - half, value + half]}
+
+    measures = {name: summary(mean) for name in (*words.LABELS, "e_upper")}
+    measures |= {name: summary(value) for name, value in others.items()}
+    return {"metrics_without_falls": measures, "settings": {"seed": 0}, "num_falls": 1, "num_envs": 8}
 
 
 @pytest.mark.parametrize(
     ("larger", "verdict"),
-    [(20.0, "holds"), (5.0, "does not hold"), (10.2, "cannot be distinguished"), (None, "not measured")],
+    [(20.0, "holds"), (5.0, "does not hold"), (10.1, "cannot be distinguished"), (None, "not measured")],
 )
 def test_an_ordering_gets_the_verdict_that_its_interval_allows(book, larger, verdict):
-    book.results["small"] = measured(10.0, 0.5)
+    book.results["small"] = measured(10.0)
     if larger is not None:
-        book.results["large"] = measured(larger, 0.5)
-    rp.ordering(book, "claim", "small", "large", "j_upper")
-    assert verdict in book.lines[-1]
+        book.results["large"] = measured(larger)
+    assert verdict in words.verdict(book, "small", "large", "j_upper")
+
+
+def test_better_than_pd_is_better_in_all_three(book):
+    book.results["pd"] = measured(1.0)
+    book.results["all"] = measured(0.5)
+    book.results["two"] = measured(0.5, j_upper=1.5)
+    book.results["same"] = measured(0.5, e_ee=1.05)
+    assert words.better_in_all(book, "pd", "all") == "**yes**"
+    assert words.better_in_all(book, "pd", "two") == "no: J_upper worse"
+    assert words.better_in_all(book, "pd", "same") == "no: e_ee not distinguishable"
+    assert words.better_in_all(book, "pd", "none") == "(not measured)"
+
+
+def test_differences_are_those_of_the_rows(book):
+    book.results |= {"a": measured(1.0), "b": measured(3.0)}
+    assert words.change(book, "b", "a", "e_torso") == "-2.000 (-2.141 to -1.859)"  # 0.1 x sqrt(2) to either side
+    assert book.differences["e_torso: a - b"]["difference"] == -2.0
 
 
 def test_numbers_are_shown_with_interval_or_reason():
-    assert rp.number({"mean": 0.12345, "ci95": [0.1, 0.2]}) == "0.123 (0.100 to 0.200)"
-    assert rp.number({"mean": None, "ci95": None, "reason": "no env stood"}) == "no env stood"
-    assert rp.number({"mean": 31.0, "ci95": None, "reason": "wide"}, 0) == "31 (wide)"
+    assert words.number({"mean": 0.12345, "ci95": [0.1, 0.2]}) == "0.123 (0.100 to 0.200)"
+    assert words.number({"mean": None, "ci95": None, "reason": "no env stood"}) == "(no env stood)"
+    assert words.number({"mean": 31.0, "ci95": None, "reason": "wide"}, 0) == "31 (wide)"
+    assert words.number(None) == "(not measured)"
+    assert words.hundredfold({"mean": 0.5, "ci95": [0.25, 0.75]}) == "50.0 (25.0 to 75.0)"
+    assert words.fallen({"num_falls": 1, "num_envs": 8}) == "12.5 (2.2 to 47.1)"
 
 
-def test_what_there_is_no_checkpoint_of_is_a_row_that_says_so(book, monkeypatch):
-    book.policies = {}
+@pytest.mark.parametrize("robot", ["h1", "g1"])
+def test_what_there_is_no_checkpoint_of_is_a_row_that_says_so(robot, tmp_path, monkeypatch):
     monkeypatch.setattr("cotap.evaluate.evaluate", lambda *_: pytest.fail("nothing may be measured"))
-    rp.impacts(book, "stance", "cotap", 1.0, "mixture")
-    rows = [line for line in book.lines if line.startswith("| K 100")]
-    assert "no checkpoint of `cotap`: not measured" in rows[0]
-    assert "0.861 / 0.101 / 46.664" in rows[0]  # the paper's own stay
+    book = Book(robot, tmp_path, tmp_path)
+    for part in rp.PARTS.values():
+        part(book)
     assert not book.results
-    rp.ablations(book, "mixture", True)
-    rp.periodic(book)
-    rp.torque_observation(book)
-    rp.fidelity(book, True)
-    rp.robustness(book, True)
-    assert sum("not measured" in line for line in book.lines) >= 20
+    page = "\n".join(book.lines)
+    assert sum("not measured" in line for line in book.lines) > 90
+    assert "{" not in page
+    assert re.search(r"\| K 100 \| no checkpoint of `cotap`: not measured \|[ |]*\| 0.861 / 0.101 / 46.664 \|", page)
+    assert re.search(r"\| FACET \| no checkpoint of `facet`: not measured \|", page)
+    assert "H1's 51 kg by 0.49 m/s" in page
+    assert ("| paper (H1) |" in page) == ("| paper |" not in page) == ("whose robot is H1" in page) == (robot == "g1")
+    assert ("### Impulse by mass" in page) == (robot == "g1")
+    for table in re.findall(r"(?:^\|.*\n)+", page, re.M):
+        assert len({line.count("|") for line in table.splitlines()}) == 1
 
 
-def test_an_error_without_bound_is_the_largest(book, monkeypatch):
-    rows = [{"axis": "x", "error": -0.3, "n": 4}, {"axis": "y", "error": None, "n": 4},
-            {"axis": "z", "error": None, "n": 0}]  # fmt: skip
-    result = {"fidelity": rows, "num_wrong_way": 3, "coverage": 0.5, "num_falls": 1, "num_envs": 12,
-              "num_unholdable": 2, "error_quantiles": {"50": 0.021, "95": 0.15}}  # fmt: skip
-    monkeypatch.setattr(book, "run", lambda *_, **__: result)
-    rp.fidelity(book, True)
-    assert "| cotap | joint | no bound | -30% / no bound / - | 2.1%, 15% | 3 | 2 | 50% | 1 of 12 |" in book.lines
-    result["error_quantiles"]["95"] = None
-    rp.fidelity(book, True)
-    assert "| cotap | joint | no bound | -30% / no bound / - | 2.1%, no bound | 3 | 2 | 50% | 1 of 12 |" in book.lines
+def test_laws_are_scaled_to_the_robot():
+    assert label("h1", PD) == "PD, kp 100"
+    assert (label("h1", SOFT), label("g1", SOFT)) == ("soft PD, kp 30", "soft PD, kp 12")
+    assert label("g1", PD) == "PD, kp 20 to 40"
+    assert arms("g1")[SOFT] == ["--left", "soft-pd:soft_gain=12", "--right", "soft-pd:soft_gain=12"]
+    assert 25.0 * mass("g1") / mass("h1") == pytest.approx(16.2, abs=0.05)
 
 
-def test_the_papers_tables_have_seven_rows_each():
-    assert all(len(rows) == len(rp.ROWS) == 7 for rows in rp.IMPACT.values())
-    assert set(rp.ROWS) <= set(rp.ARMS)
+def test_every_ordering_is_one_that_the_paper_shows():
+    column = {"e_torso": 0, "e_ee": 1, "j_upper": 2}
+    for rows in IMPACT.values():
+        assert set(rows) == {PD, SOFT, *COMPLIANT} <= set(arms("h1"))
+        for measure, smaller, larger in ORDERINGS:
+            assert rows[smaller][column[measure]] < rows[larger][column[measure]]
 
 
-def test_page_and_json_are_written(book, tmp_path):
-    book.add("# Title")
-    book.results["x"] = measured(1.0, 0.1) | {"curve": [1] * 1000, "settings": {"seed": 7, "env": {"robot": "h1"}}}
-    rp.write(tmp_path, book)
-    assert (tmp_path / "results.md").read_text() == "# Title\n"
-    written = json.loads((tmp_path / "results.json").read_text())["rows"]["x"]
-    assert written.keys() == {"metrics_without_falls", "settings"}
-    assert written["settings"] == {"seed": 7}
+def test_three_trainings_give_students_interval():
+    """Of 1, 2, 3: mean 2, deviation 1; t of two degrees of freedom is 4.3027, and 4.3027 / sqrt(3) is 2.4841."""
+    three = Trainings((1.0, 2.0, 3.0))
+    assert three.interval == pytest.approx((-0.4841, 4.4841), abs=1e-4)
+    assert three.text() == "2.000 (range 1.000 to 3.000; interval -0.484 to 4.484)"
+    assert three.outside(4.5)
+    assert three.outside(-0.5)
+    assert not three.outside(4.4)
+    one = Trainings((1.0,))
+    assert one.text(1) == "1.0 (range 1.0 to 1.0; one training: no interval)"
+    assert not one.outside(9.0)
+    assert Trainings(()).text() == "(not measured)"
+
+
+def test_an_ablation_outside_the_trainings_is_marked(book, monkeypatch):
+    """Trainings of 1, 2 and 3 in every measure: the interval ends at 4.4841."""
+    values = {"seed-0": 1.0, "seed-1": 2.0, "seed-2": 3.0, "no-ratio": 5.0, "goals": 4.0, "cotap": 9.0}
+    monkeypatch.setattr(Book, "has", lambda _, policy: policy in values)
+    monkeypatch.setattr(Book, "checkpoint", lambda *_: {"samples": 15_000_000})
+    run = {name: measured(value, e_upper=2.0) for name, value in values.items()}
+    monkeypatch.setattr(Book, "run", lambda _, __, policy, *___: run.get(policy))
+    ablation.ablation(book)
+    rows = {line.split(" | ")[0][2:]: line.split(" | ")[1:4] for line in book.lines if line.startswith("| ")}
+    assert rows["without the ratio"] == ["15.0", "**5.000 (4.900 to 5.100)**", "2.000 (1.900 to 2.100)"]
+    assert rows["goals observed"][1] == "4.000 (3.900 to 4.100)"
+    assert rows["CoTaP, three seeds"][1] == "2.000 (range 1.000 to 3.000; interval -0.484 to 4.484)"
+    assert rows["CoTaP"][1] == "9.000 (8.900 to 9.100)"  # another training, not marked
+    del values["seed-1"]
+    book.lines.clear()
+    ablation.ablation(book)
+    assert any(line.startswith("| CoTaP, three seeds (2 there) |") for line in book.lines)
+
+
+def test_the_relative_change_is_of_envs_that_stood_in_both():
+    before = {"stood": [1.0, 1.0, 1.0, 1.0, 0.0], "e_ee": [1.0, 2.0, 3.0, None, 5.0]}
+    after = {"stood": [1.0, 1.0, 1.0, 1.0, 1.0], "e_ee": [2.0, 4.0, 6.0, 1.0, 900.0]}
+    change = relative.relative_change(before, after, "e_ee")
+    assert change == {"mean": pytest.approx(1.0), "ci95": pytest.approx([1.0, 1.0]), "n": 3}
+    fallen = relative.relative_change(before | {"stood": [0.0] * 5}, after, "e_ee")
+    assert (fallen["mean"], fallen["n"]) == (None, 0)
+
+
+def test_the_relative_change_has_a_bootstrap_interval():
+    """100 envs at 1 before, half of them at 0.5 and half at 0.9 after: 0.7 of it, give or take 1.96 x 0.2 / 10."""
+    before = {"stood": [1.0] * 100, "e_ee": [1.0] * 100}
+    after = {"stood": [1.0] * 100, "e_ee": [0.5, 0.9] * 50}
+    change = relative.relative_change(before, after, "e_ee")
+    assert change["mean"] == pytest.approx(-0.3)
+    assert change["ci95"] == pytest.approx([-0.339, -0.261], abs=0.005)
+
+
+def test_an_error_without_bound_is_the_largest():
+    rows = [{"axis": "x", "error": -0.3, "ci95": [-0.4, -0.2], "n": 4}, {"axis": "x", "error": 0.1, "n": 4},
+            {"axis": "y", "error": None, "n": 4}, {"axis": "z", "error": None, "n": 0}]  # fmt: skip
+    assert [fidelity.worst(rows, axis) for axis in "xyz"] == ["-30% (-40% to -20%)", "no bound", "(not measured)"]
+    assert fidelity.single_hands({"50": 0.021, "95": None}) == "2.1%, no bound"
+
+
+def test_a_walk_is_no_worse_within_a_tenth_or_the_interval():
+    base = {"mean": 1.0, "ci95": [0.8, 1.2]}
+    assert walking.no_worse({"mean": 1.19}, base)
+    assert not walking.no_worse({"mean": 1.21}, base)
+    assert walking.no_worse({"mean": 1.09}, {"mean": 1.0, "ci95": [0.99, 1.01]})
+    assert walking.no_worse({"mean": None}, base) is None
 
 
 def test_only_evaluations_of_the_same_policy_and_settings_are_kept(book, monkeypatch):
     """Neither one of another checkpoint nor one of other envs or options is taken for what was asked for."""
     asked = []
+    book.policies["base"] = str(save_random_policy(book.folder / "policy.pt"))
 
     def evaluate(arguments):
         asked.append(arguments)
-        return {"settings": {"checkpoint_sha256": sha256(book.policies["base"])}}
+        return measured(1.0) | {"settings": {"checkpoint_sha256": sha256(book.policies["base"])}, "protocol": "impact"}
 
     monkeypatch.setattr("cotap.evaluate.evaluate", evaluate)
     path = book.evaluations / "row.json"
@@ -110,31 +197,54 @@ def test_only_evaluations_of_the_same_policy_and_settings_are_kept(book, monkeyp
         path.write_text(json.dumps(written | changed))
         book.run("row", "base", "impact", "--alpha", "0.5")
         assert (not asked) == kept
+    assert str(book.folder) not in json.dumps(book.summary())
+    assert book.summary()["rows"]["row"]["arguments"][:3] == ["impact", "--num-envs", "4"]
 
 
-def test_differences_say_what_was_measured_and_what_was_not(book):
-    rp.differences(book)
-    page = "\n".join(book.lines)
-    assert "(not measured)" in page
-    assert "of 51 kg by 0.49 m/s" in page
-    assert "{" not in page
-    for row, mean in (("K-100", 1.0), ("PD-kp-100", 3.0)):
-        book.results[f"impact-stance-cotap-{row}"] = measured(mean, 0.1) | {"num_falls": 1, "num_envs": 8}
-    rp.differences(book)
-    page = "\n".join(book.lines)
-    assert "less ours under PD: -2.000 (-2.141 to -1.859) m/s" in page
-    assert "Of ours 12.5 % (2.2 to 47.1) fall" in page
-    assert book.differences["e_torso: impact-stance-cotap-K-100 - impact-stance-cotap-PD-kp-100"]["difference"] == -2.0
+def test_only_the_parts_that_are_asked_for_are_measured(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    ran: list[Book] = []
+    monkeypatch.setattr(rp, "PARTS", {"impact": ran.append, "load": lambda _: pytest.fail("not asked for")})
+    assert rp.main(["--only", "impact", "--reuse", "--threads", "1", "--robot", "g1"]) == 0
+    (book,) = ran
+    assert (book.envs, book.reuse, book.threads) == (4096, True, 1)
+    assert (book.policies["base"], book.policies["cotap"]) == ("g1-base", "g1-cotap")
+    assert (tmp_path / "runs/paper/results_g1.md").read_text().startswith("# The paper's tables and figures")
+    assert json.loads((tmp_path / "runs/paper/results/g1/results.json").read_text())["robot"] == "g1"
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (["--only", "impacts"], "impacts"),
+        (["--policies", "cotap"], "NAME=CHECKPOINT"),
+        (["--policies", "best=a.pt"], "best"),
+        (["--policies", "goals=missing.pt"], "missing.pt"),
+        (["--num-envs", "-1"], "-1"),
+        (["--robot", "g1", "--policies", "cotap=h1.pt"], "is of h1, not of g1"),
+    ],
+)
+def test_bad_input_is_named_and_nothing_is_written(options, named, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    save_random_policy(tmp_path / "h1.pt")
+    with pytest.raises(SystemExit) as stop:
+        rp.main(options)
+    assert stop.value.code == 2
+    assert named in capsys.readouterr().err
+    assert not (tmp_path / "docs").exists()
 
 
 @pytest.mark.slow
-def test_a_part_end_to_end(tmp_path, monkeypatch):
-    """With a policy that has learned nothing, and so falls."""
+@pytest.mark.parametrize(("robot", "parts"), [("h1", ["load", "periodic"]), ("g1", ["load"])])
+def test_a_part_end_to_end(robot, parts, tmp_path, monkeypatch):
+    """With policies that have learned nothing, and so fall."""
     monkeypatch.chdir(tmp_path)
-    policy = save_random_policy(tmp_path / "policy.pt", "distill")
-    arguments = ["--quick", "--num-envs", "8", "--threads", "1", "--policies", f"cotap={policy}", f"base={policy}"]
-    monkeypatch.setattr(sys, "argv", ["reproduce_paper.py", *arguments, "--only", "load", "periodic"])
-    assert rp.main() == 0
-    page = (tmp_path / "runs/paper-quick/results.md").read_text()
+    policy = save_random_policy(tmp_path / "policy.pt", "distill", robot)
+    options = ["--robot", robot, "--quick", "--num-envs", "8", "--threads", "1", "--policies", f"cotap={policy}"]
+    assert rp.main([*options, "--only", *parts]) == 0
+    page = (tmp_path / "runs/paper-quick" / ("results.md" if robot == "h1" else "results_g1.md")).read_text()
     assert "| K_z 500 |" in page
-    assert (tmp_path / "runs/paper-quick/results/periodic_load_base.png").stat().st_size > 5000
+    assert "100.0 (67.6 to 100.0)" in page  # all fell
+    assert (tmp_path / f"runs/paper-quick/results/{robot}/constant_load.png").stat().st_size > 5000
+    kept = json.loads((tmp_path / f"runs/paper-quick/results/{robot}/results.json").read_text())
+    assert kept["rows"]["load-PD"]["num_envs"] == 8

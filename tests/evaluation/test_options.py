@@ -20,10 +20,10 @@ from cotap.evaluate import PROTOCOLS, arms_of, main, parse, usage
 from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.policy import load_policy
 from cotap.evaluation.scenario import MODES
+from cotap.robots import ROBOTS
 from cotap.robots.chains import arm_model
 from release.publish import EVALUATIONS
-from reports import distillation_report  # noqa: F401 - that it can be loaded
-from reports.reproduce_paper import ARMS
+from reports.paper.arms import arms
 
 EVERYWHERE: dict[str, Any] = {"seed": 0, "torque_limit_scale": 1.0, "randomize": True}
 """Options of all protocols beside `num_envs`, and their defaults."""
@@ -89,7 +89,9 @@ def test_every_evaluation_can_be_filmed(protocol):
     assert parse([protocol, "--video", "film.mp4"]).video == "film.mp4"
 
 
-@pytest.mark.parametrize("arguments", [*EVALUATIONS.values(), *(["impact", *law] for law in ARMS.values())])
+@pytest.mark.parametrize(
+    "arguments", [*EVALUATIONS.values(), *(["impact", *law] for robot in ROBOTS for law in arms(robot).values())]
+)
 def test_what_the_reports_ask_for_is_understood(arguments):
     options = parse([a if a != "ENVS" else "16" for a in arguments])
     options.protocol.check()

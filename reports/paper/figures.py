@@ -1,0 +1,68 @@
+"""Figures of the page."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from reports.paper.book import Book
+
+Shot = tuple[str, list[str], tuple[float, ...]]
+"""What is in a picture, the arguments of its evaluation, and when it is taken [s]."""
+
+
+def plot_curves(path: Path, curves: dict[str, tuple[list[float], list[float]]], x: str, y: str) -> None:
+    """Several curves on one axis."""
+    figure, axis = _axes(1)
+    for name, (time, values) in curves.items():
+        if time:
+            axis[0].plot(time, values, label=name)
+    axis[0].axvline(0.0, color="0.6", lw=0.8)
+    _finish(path, figure, axis[0], xlabel=x, ylabel=y)
+
+
+def plot_fall_curves(path: Path, results: dict[str, dict[str, Any]]) -> None:
+    """Shares of falls against impulse, on one axis."""
+    from cotap.evaluation.fall_curve import draw_fall_curve
+
+    figure, axis = _axes(1)
+    for (name, result), color in zip(results.items(), ("#cb181d", "#2171b5"), strict=False):
+        draw_fall_curve(axis[0], result, color, name)
+    _finish(path, figure, axis[0], xlabel="impulse [N s]", ylabel="share of envs that fell", ylim=(-0.02, 1.02))
+
+
+def draw_pictures(book: Book, name: str, caption: str, shots: Iterable[Shot]) -> None:
+    """A row of pictures of robots."""
+    from cotap.evaluate import pictures
+    from cotap.evaluation.report import save_figure
+
+    images = []
+    for label, args, times in shots:
+        images += [(f"{label} {t:g} s".strip(), image) for t, image in zip(times, pictures(args, times), strict=True)]
+    figure, axes = _axes(len(images), (2.6 * len(images), 2.9))
+    for axis, (label, image) in zip(axes, images, strict=True):
+        axis.imshow(image)
+        axis.set_title(label, fontsize=10)
+        axis.axis("off")
+    save_figure(figure, book.figure(name, caption))
+
+
+def _axes(columns: int, size: tuple[float, float] = (7.5, 4.2)) -> tuple[Any, Any]:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, columns, figsize=size, constrained_layout=True, squeeze=False)
+    return figure, axes[0]
+
+
+def _finish(path: Path, figure: Any, axis: Any, **labels: Any) -> None:
+    from cotap.evaluation.report import save_figure
+
+    axis.set(**labels)
+    axis.grid(alpha=0.2)
+    if axis.get_legend_handles_labels()[0]:
+        axis.legend(frameon=False)
+    save_figure(figure, path)
