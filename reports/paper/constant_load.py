@@ -22,10 +22,10 @@ CLAIMS = (
     ("At alpha 0.5 it goes less beyond its rest than at K_z 100", "alpha 0.5", "K_z 100", "load_overshoot"),
 )
 """Of the paper: what is smaller in the first row than in the second."""
-WHY = """F / K is 0.10 m at K_z 500, where the paper has 0.05 m and ours displaces the hand by {stiff} m, and 0.5 m at
-K_z 100, where the paper has 0.12 m and ours is {soft} m: more than an arm can reach, and near its end the ratio gives
-way to PD. Stiffness acts on joint errors here, which is exact for small displacements only. {paper} has a hand that
-reverses under PD (-0.03 m). At rest a hand lies on the load's side (ours: {pd} m), so that would be motion, or the
+WHY = """{paper} has a hand error of 0.05 m at K_z 500, where F / K is 0.10 m and ours goes {stiff} m in z, and of 0.12
+m at K_z 100, where ours goes {soft} m. F / K is 0.5 m there, more than an arm can reach, and near its end the ratio
+gives way to PD. Stiffness acts on joint errors here, which is exact for small displacements only. Under PD the paper's
+hand reverses (-0.03 m). At rest a hand lies on the load's side (ours at {pd} m), so that would be motion, or the
 policy's own arm actions. Ours first goes beyond its rest, by {pd_over} of the way under PD and {blend_over} at alpha
 0.5."""
 
@@ -58,7 +58,7 @@ def constant_load(book: Book) -> None:
         pd_over=of(book, key(PD), "load_overshoot", 2),
         blend_over=of(book, key("alpha 0.5"), "load_overshoot", 2),
     )
-    book.table("the paper says", "here")
+    book.table(f"claim of the {book.paper}", "here")
     for claim, smaller, larger, measure in CLAIMS:
         book.row(claim, verdict(book, key(smaller), key(larger), measure))
     if curves:

@@ -136,7 +136,7 @@ def compare_with_pd(book: Book) -> None:
 def orderings(book: Book) -> None:
     """Every ordering of the paper's table with its verdict."""
     book.add("", "### The paper's orderings")
-    book.table("the paper has", *MODES, *(f"{mode}, first 0.1 s" for mode in MODES))
+    book.table(f"ordering of the {book.paper}", *MODES, *(f"{mode}, first 0.1 s" for mode in MODES))
     for measure, smaller, larger in ORDERINGS:
         windows = ("j_upper", "j_upper_blow") if measure == "j_upper" else (measure,)
         found = (
