@@ -108,13 +108,13 @@ def test_every_ordering_is_one_that_the_paper_shows():
 
 
 def test_three_trainings_give_students_interval():
-    """Of 1, 2, 3: mean 2, deviation 1; t of two degrees of freedom is 4.3027, and 4.3027 / sqrt(3) is 2.4841."""
+    """Of 1, 2, 3: mean 2, deviation 1; t of two degrees of freedom is 4.3027, and 4.3027 sqrt(4 / 3) is 4.9683."""
     three = Trainings((1.0, 2.0, 3.0))
-    assert three.interval == pytest.approx((-0.4841, 4.4841), abs=1e-4)
-    assert three.text() == "2.000 (range 1.000 to 3.000; interval -0.484 to 4.484)"
-    assert three.outside(4.5)
-    assert three.outside(-0.5)
-    assert not three.outside(4.4)
+    assert three.interval == pytest.approx((-2.9683, 6.9683), abs=1e-4)
+    assert three.text() == "2.000 (range 1.000 to 3.000; interval -2.968 to 6.968)"
+    assert three.outside(7.0)
+    assert three.outside(-3.0)
+    assert not three.outside(6.9)
     one = Trainings((1.0,))
     assert one.text(1) == "1.0 (range 1.0 to 1.0; one training: no interval)"
     assert not one.outside(9.0)
@@ -122,17 +122,17 @@ def test_three_trainings_give_students_interval():
 
 
 def test_an_ablation_outside_the_trainings_is_marked(book, monkeypatch):
-    """Trainings of 1, 2 and 3 in every measure: the interval ends at 4.4841."""
-    values = {"seed-0": 1.0, "seed-1": 2.0, "seed-2": 3.0, "no-ratio": 5.0, "goals": 4.0, "cotap": 9.0}
+    """Trainings of 1, 2 and 3 in every measure: a fourth would be below 6.9683."""
+    values = {"seed-0": 1.0, "seed-1": 2.0, "seed-2": 3.0, "no-ratio": 8.0, "goals": 4.0, "cotap": 9.0}
     monkeypatch.setattr(Book, "has", lambda _, policy: policy in values)
     monkeypatch.setattr(Book, "checkpoint", lambda *_: {"samples": 15_000_000})
     run = {name: measured(value, e_upper=2.0) for name, value in values.items()}
     monkeypatch.setattr(Book, "run", lambda _, __, policy, *___: run.get(policy))
     ablation.ablation(book)
     rows = {line.split(" | ")[0][2:]: line.split(" | ")[1:4] for line in book.lines if line.startswith("| ")}
-    assert rows["without the ratio"] == ["15.0", "**5.000 (4.900 to 5.100)**", "2.000 (1.900 to 2.100)"]
+    assert rows["without the ratio"] == ["15.0", "**8.000 (7.900 to 8.100)**", "2.000 (1.900 to 2.100)"]
     assert rows["goals observed"][1] == "4.000 (3.900 to 4.100)"
-    assert rows["CoTaP, three seeds"][1] == "2.000 (range 1.000 to 3.000; interval -0.484 to 4.484)"
+    assert rows["CoTaP, three seeds"][1] == "2.000 (range 1.000 to 3.000; interval -2.968 to 6.968)"
     assert rows["CoTaP"][1] == "9.000 (8.900 to 9.100)"  # another training, not marked
     del values["seed-1"]
     book.lines.clear()

@@ -24,8 +24,8 @@ ROWS = {
 CALM = ["--force", "0", "0", "0"]
 COLUMNS = (("e_torso", True), ("e_upper", True), ("e_upper", False))
 """Measures of the table, and whether the hand is pushed."""
-WHY = """In bold: outside the interval. That is the 95 % interval (Student's t) of the mean of CoTaP's trainings, over
-their seeds; with three of them, a single further training would fall into one twice as wide. {paper} had a base that
+WHY = """In bold: outside the interval in which a further training of CoTaP with another seed would lie with 95 %
+probability (Student's t). {paper} had a base that
 could not be controlled under compliance, and with the raw reference as target followed it half as well as with CoTaP.
 Of ours {base} % fell, of CoTaP's {cotap} %; from CoTaP to no training e_upper changes by {push} rad with the push, by
 {calm} rad without. The paper's policy without the ratio shuns stretched arms (0.517 rad). Ours, trained so, changes

@@ -1,4 +1,4 @@
-"""One figure from several trainings: its mean, its range, and what another mean of as many trainings could be."""
+"""One figure from several trainings: its mean, its range, and where that of a further training would lie."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ class Trainings:
 
     @property
     def interval(self) -> tuple[float, float] | None:
-        """95 % interval of the mean over trainings, by Student's t; None of fewer than two."""
+        """Where one more training would lie with 95 % probability, by Student's t; None of fewer than two."""
         n = len(self.values)
         if n < 2:
             return None
-        half = float(student.ppf(0.975, n - 1)) * stdev(self.values) / n**0.5
+        half = float(student.ppf(0.975, n - 1)) * stdev(self.values) * (1.0 + 1.0 / n) ** 0.5
         return mean(self.values) - half, mean(self.values) + half
 
     def outside(self, value: float) -> bool:
