@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 from collections.abc import Callable
@@ -143,6 +144,8 @@ def test_statics_is_jacobian_transpose_and_compliance(any_spec, any_model):
 def test_a_small_comparison_is_written_whole(shipped_file, tmp_path, monkeypatch):
     monkeypatch.setattr(sim_to_sim, "LAWS", {"PD": "pd"})
     monkeypatch.setattr(sim_to_sim, "PERTURBATIONS", {"late": Perturbations(delay_steps=(1, 1))})
+    # A load that any policy bears: whether this one falls under more is not the report's business.
+    monkeypatch.setattr(sim_to_sim, "periodic", functools.partial(sim_to_sim.periodic, amplitude=10.0))
     arguments = ["--policy", str(shipped_file), "--engines", "mujoco", "--trials", "1", "--perturbed-trials", "1",
                  "--load-trials", "1", "--episode-seconds", "2", "--timestep", "0.01", "--jobs", "1", "--output",
                  str(tmp_path)]  # fmt: skip
