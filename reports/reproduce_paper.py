@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from cotap.robots import ROBOTS
 from reports.paper.ablation import ablation, samples
 from reports.paper.beyond import beyond
 from reports.paper.book import POLICIES, Book
@@ -53,7 +54,7 @@ ELSEWHERE = (
 def main(argv: Sequence[str] | None = None) -> int:
     """Parse, measure, write the page. Returns the exit status; bad input ends the program with 2."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--robot", default="h1", choices=("h1", "g1"), help="whose policies are measured")
+    parser.add_argument("--robot", default="h1", choices=tuple(ROBOTS), help="whose policies are measured")
     parser.add_argument("--quick", action="store_true", help="128 envs a row, a short punch tour")
     parser.add_argument("--num-envs", type=int, default=0, help="envs a row; 4096, or 128 with --quick")
     parser.add_argument("--threads", type=int, default=0, help="0 takes every CPU")

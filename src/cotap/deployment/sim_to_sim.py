@@ -52,6 +52,8 @@ PERTURBATIONS = {
     "all at once, delay of 1 to 2 steps": Perturbations((1, 2), 0.05, 0.01, 0.5, 0.2, 0.05),
 }
 """Every row of the table of perturbations."""
+APART = Perturbations(start_error=0.02)
+"""Of robots under one load, which would else all do the same."""
 SWINGS = ("elbow_torque_nm", "elbow_torque_statics_nm", "hand_swing_m", "hand_swing_statics_m")
 """Amplitudes under the periodic load, and what statics makes of them; null where no trial stood."""
 LAWS = {
@@ -180,7 +182,7 @@ def loads(run: Run, spec: RobotSpec, protocol: Impact, cfg: Comparison) -> dict[
     scenario = Scenario(protocol.seconds, command=STAND, force=(force,))
     for label, text in LAWS.items():
         law = parse_law("left", text, LawConfig())
-        trials = run(scenario, cfg.load_trials, UpperBodyConfig(law, replace(law)), Perturbations(start_error=0.02))
+        trials = run(scenario, cfg.load_trials, UpperBodyConfig(law, replace(law)), APART)
         t = _trajectory(trials, protocol.seconds)
         begin, first, last = (round((protocol.onset + s) / t.dt) for s in (0.0, *protocol.window))
         hit = [i for i, arm in enumerate(spec.arms) if protocol.hand in (arm.side, "both")]
@@ -208,7 +210,7 @@ def periodic(
     laws = UpperBodyConfig(LawConfig("cotap", (500.0, 500.0, 500.0), 25.0, 0.7), LawConfig("pd"))
     load = ForceProfile((0.0, 0.0, amplitude), "both", ONSET_S, period_s=period)
     seconds = ONSET_S + 3.0 * period
-    trials = run(Scenario(seconds, command=STAND, force=(load,)), cfg.load_trials, laws)
+    trials = run(Scenario(seconds, command=STAND, force=(load,)), cfg.load_trials, laws, APART)
     t = _trajectory(trials, seconds)
     begin = round((ONSET_S + period) / t.dt)  # the first period is left out
     stood = ~t.fell.any(0)
