@@ -54,10 +54,11 @@ def trajectory(steps: int = 200, envs: int = 2, **changes: torch.Tensor) -> Traj
 
 def test_perfect_tracking_has_no_error():
     m = tracking_measures(trajectory(), gait_period_s=0.8)
-    for name in ("e_lin", "e_lin_gait", "e_yaw", "e_yaw_gait", "e_height", "e_upper", "foot_slip", "fall_fraction"):
+    for name in ("e_lin", "e_lin_gait", "e_yaw", "e_yaw_gait", "e_upper", "foot_slip", "fall_fraction"):
         assert m[name].tolist() == pytest.approx([0.0, 0.0], abs=1e-6), name
     assert m["episode_length_fraction"].tolist() == [1.0, 1.0]
-    assert m["stand_drift"].isnan().all()
+    for of_standing in ("stand_drift", "e_height"):
+        assert m[of_standing].isnan().all()
     assert m["swing_height"].isnan().all()
 
 
@@ -65,7 +66,7 @@ def test_constant_errors_by_hand():
     t = trajectory()
     t.velocity[:, 0] += torch.tensor([0.3, -0.4, 0.25])  # norm 0.5
     t.velocity[:, 1, 2] -= 0.1
-    t.height[:, 0] -= 0.03
+    t.stand[:], t.height[:, 0] = True, 0.97
     t.arm_error[:, 1, :4] = 0.1  # norm 0.2
     t.arm_torque[:, 0, 0], t.arm_torque[:, 0, 1] = 3.0, 4.0
     t.hand_error[:, 0, 0] = 0.2
@@ -102,6 +103,7 @@ def test_errors_are_taken_only_once_a_command_has_settled():
 def test_a_height_has_time_to_change():
     """0.2 m down, reached in 1.4 s and no sooner; from 1.5 s on all that is off counts, whatever velocities do."""
     t = trajectory(envs=2)
+    t.stand[:] = True
     t.height_command[100:] = 0.8
     t.height[170:] = 0.8
     t.height[:, 1] -= 0.03
@@ -120,15 +122,28 @@ def test_a_robot_that_ignores_its_command_is_seen_to():
     t.foot_contact[::2, :, 0] = False
     m = tracking_measures(t, 0.8)
     expected = {"e_lin": [0.5, 0.5, 0.3], "e_lin_gait": [0.5, 0.5, 0.3], "e_yaw": [0.3, 0.3, 0.0],
-                "e_yaw_gait": [0.3, 0.3, 0.0], "e_height": [0.0, 0.0, 0.2]}  # fmt: skip
+                "e_yaw_gait": [0.3, 0.3, 0.0], "e_height": [math.nan, math.nan, 0.2]}  # fmt: skip
     for name, values in expected.items():
-        assert m[name].tolist() == pytest.approx(values, abs=1e-5), name
+        assert m[name].tolist() == pytest.approx(values, abs=1e-5, nan_ok=True), name
     assert tracking_slopes(t, 0.8)["slope_x"] == pytest.approx(0.0, abs=1e-6)
     assert float(m["stand_drift"][2]) == pytest.approx(0.3)
     assert float(m["still_share"][2]) == 0.0
     t.velocity.zero_()  # it no longer moves, and steps in place
     assert float(tracking_measures(t, 0.8)["still_share"][2]) == pytest.approx(0.5, abs=0.01)
     assert m["still_share"][:2].isnan().all()
+
+
+@pytest.mark.parametrize(("share", "error"), [(1.0, 0.0), (0.5, 0.05), (0.0, 0.1), (-1.0, 0.2)])
+def test_heights_are_measured_of_those_who_are_asked_to_stand(share, error):
+    """One stands 0.2 m lower, one as it is; two walk at nominal height, as they are asked, which is no merit."""
+    t = trajectory(envs=4)
+    t.stand[:, :2] = True
+    t.height_command[:, 0] = 0.8
+    t.height[:, 0] = 1.0 - 0.2 * share
+    m = tracking_measures(t, 0.8)
+    assert float(m["e_height"].nanmean()) == pytest.approx(error, abs=1e-6)
+    assert m["e_height"][2:].isnan().all()
+    assert tracking_slopes(t, 0.8)["slope_height"] == pytest.approx(share, abs=1e-5)
 
 
 @pytest.mark.parametrize("asked", ["walk", "stand"])
@@ -145,7 +160,8 @@ def test_an_env_whose_policy_ignores_what_is_asked(make_env, robot, asked):
     assert (t.stand == stands).all()
     m = tracking_measures(t, env.cfg.gait.period_s)
     assert m["e_lin_gait"].tolist() == pytest.approx([0.0 if stands else 0.5] * n, abs=0.02)
-    torch.testing.assert_close(m["e_height"], (t.height - height)[-1], atol=0.01, rtol=0)
+    off = (t.height - height)[-1] if stands else torch.full((n,), math.nan)
+    torch.testing.assert_close(m["e_height"], off, atol=0.01, rtol=0, equal_nan=True)
     assert m["still_share"].tolist() == [0.0] * n if stands else m["still_share"].isnan().all()  # feet in the air
 
 

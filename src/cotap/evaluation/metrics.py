@@ -45,6 +45,12 @@ def settled(trajectory: Trajectory, settle_s: float) -> torch.Tensor:
     return (steps_since_change(command) >= round(settle_s / trajectory.dt)) & trajectory.alive()
 
 
+def settled_height(t: Trajectory) -> torch.Tensor:
+    """(T, N) bool: on its feet, asked to stand, and at one height for `HEIGHT_SETTLE_S`."""
+    asked = torch.stack((t.height_command, t.stand.float()), 2)
+    return (steps_since_change(asked) >= round(HEIGHT_SETTLE_S / t.dt)) & t.stand & t.alive()
+
+
 def slope(commanded: torch.Tensor, measured: torch.Tensor, mask: torch.Tensor) -> float:
     """Least-squares slope, with intercept, of measured against commanded over all samples in `mask`."""
     x, y = commanded[mask].double(), measured[mask].double()
@@ -74,8 +80,9 @@ def swing_heights(foot_height: torch.Tensor, contact: torch.Tensor, mask: torch.
 def tracking_measures(t: Trajectory, gait_period_s: float, settle_s: float = 1.0) -> dict[str, torch.Tensor]:
     """Velocity-tracking measures per env, (N,) each; NaN where an env has nothing to measure.
 
-    Errors are against what was asked, once that has held for `settle_s`, a height for `HEIGHT_SETTLE_S`. `_gait` errors
-    use velocities averaged over a gait period, all of it settled, and so do `stand_drift`, the speed while asked to
+    Errors are against what was asked, once that has held for `settle_s`. Heights count for robots that are asked to
+    stand, which alone are asked for other heights than the nominal, once theirs has held for `HEIGHT_SETTLE_S`. `_gait`
+    errors use velocities averaged over a gait period, all of it settled, and so do `stand_drift`, the speed while asked to
     stand, and `still_share`, the share of that time that is slower than `STILL_SPEED` with all feet down.
     """
     period = round(gait_period_s / t.dt)
@@ -89,7 +96,6 @@ def tracking_measures(t: Trajectory, gait_period_s: float, settle_s: float = 1.0
     ).clamp_min(1)
     average = moving_average(t.velocity, period)
     error_gait = average - t.command
-    ok_height = (steps_since_change(t.height_command.unsqueeze(2)) >= round(HEIGHT_SETTLE_S / t.dt)) & t.alive()
     ok_stand = steps_since_change(t.stand.unsqueeze(2)) >= round((settle_s + gait_period_s) / t.dt)
     ok_stand = ok_stand & t.stand & t.alive()
     drift = average[..., :2].norm(dim=2)
@@ -99,7 +105,7 @@ def tracking_measures(t: Trajectory, gait_period_s: float, settle_s: float = 1.0
         "e_lin_gait": masked_mean(error_gait[..., :2].norm(dim=2), ok_gait),
         "e_yaw": masked_mean(error[..., 2].abs(), ok),
         "e_yaw_gait": masked_mean(error_gait[..., 2].abs(), ok_gait),
-        "e_height": masked_mean((t.height - t.height_command).abs(), ok_height),
+        "e_height": masked_mean((t.height - t.height_command).abs(), settled_height(t)),
         "e_upper": masked_mean(t.arm_error.norm(dim=2), t.alive()),
         "e_ee": masked_mean(t.hand_error.mean(2), t.alive()),
         "j_upper": masked_mean(t.arm_torque.norm(dim=2), t.alive()),
@@ -114,10 +120,14 @@ def tracking_measures(t: Trajectory, gait_period_s: float, settle_s: float = 1.0
 
 
 def tracking_slopes(t: Trajectory, gait_period_s: float, settle_s: float = 1.0) -> dict[str, float]:
-    """Slopes of measured (gait-averaged) against commanded velocity while walking, over all envs."""
+    """Slopes of measured (gait-averaged) against commanded velocity while walking, and of height while standing, over
+    all envs."""
     measured = moving_average(t.velocity, round(gait_period_s / t.dt))
     ok = settled(t, settle_s + gait_period_s) & ~t.stand
-    return {f"slope_{name}": slope(t.command[..., i], measured[..., i], ok) for i, name in enumerate(("x", "y", "yaw"))}
+    slopes = {
+        f"slope_{axis}": slope(t.command[..., i], measured[..., i], ok) for i, axis in enumerate(("x", "y", "yaw"))
+    }
+    return slopes | {"slope_height": slope(t.height_command, t.height, settled_height(t))}
 
 
 def summarize(values: torch.Tensor, seed: int = 0, resamples: int = 1000) -> dict[str, Any]:
