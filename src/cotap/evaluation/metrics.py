@@ -82,8 +82,8 @@ def tracking_measures(t: Trajectory, gait_period_s: float, settle_s: float = 1.0
 
     Errors are against what was asked, once that has held for `settle_s`. Heights count for robots that are asked to
     stand, which alone are asked for other heights than the nominal, once theirs has held for `HEIGHT_SETTLE_S`. `_gait`
-    errors use velocities averaged over a gait period, all of it settled, and so do `stand_drift`, the speed while asked to
-    stand, and `still_share`, the share of that time that is slower than `STILL_SPEED` with all feet down.
+    errors use velocities averaged over a gait period, all of it settled, and so do `stand_drift`, the speed while asked
+    to stand, and `still_share`, the share of that time that is slower than `STILL_SPEED` with all feet down.
     """
     period = round(gait_period_s / t.dt)
     ok = settled(t, settle_s)
