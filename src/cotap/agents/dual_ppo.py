@@ -37,7 +37,7 @@ class DualPPOConfig:
     """Standard deviation of actions at the start."""
     std_half_life: float = 3000.0
     """Iterations in which the largest standard deviation allowed falls by half: wide at first, precise later."""
-    least_std: float = 0.2
+    least_std: float = 0.12
     """Where that fall ends."""
     steps: int = 24
     """Steps per env and iteration."""

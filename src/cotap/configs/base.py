@@ -59,7 +59,7 @@ def default() -> BaseTraining:
             assist=AssistConfig(enabled=True),
             forces=ExternalForceConfig(
                 hand_loads=HandLoadConfig(enabled=True, ramp=RampConfig(16e6, 60e6, first=0.1)),
-                pushes=PushConfig(enabled=True, velocity=(0.0, 1.3), ramp=RampConfig(20e6, 80e6)),
+                pushes=PushConfig(enabled=True, velocity=(0.0, 1.2), ramp=RampConfig(20e6, 80e6)),
             ),
         ),
         runner=RunnerConfig(iterations=12_207),
@@ -104,15 +104,6 @@ def paper() -> BaseTraining:
     )  # fmt: skip
 
 
-def tour() -> BaseTraining:
-    """`default`, but any link is pushed as hard as the base: for the punch tour, and what ships for G1."""
-    training = default()
-    pushes = training.env.forces.pushes
-    pushes.hand_velocity = pushes.link_velocity = pushes.velocity
-    pushes.hand_share, pushes.link_share = 0.2, 0.4
-    return training
-
-
 def facet() -> BaseTraining:
     """FACET as the paper trains it: PD arms, its tracking reward on the data's own motion, no moving reference."""
     training = default()
@@ -132,7 +123,6 @@ BASE_RECIPES: dict[str, Callable[[], BaseTraining]] = {
     "default": default,
     "quick": quick,
     "paper": paper,
-    "tour": tour,
     "facet": facet,
 }
 """Stage 1, by name."""

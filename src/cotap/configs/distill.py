@@ -37,9 +37,7 @@ def default(base: BaseTraining) -> DistillTraining:
         left=LawConfig(name="cotap"), right=LawConfig(name="cotap"), sampling=LawSampling(enabled=True, full_alpha=0.25)
     )
     _after_base(training, base)
-    pushes = env.forces.pushes
-    pushes.hand_share = 0.5  # hands are what the law is for
-    pushes.hand_velocity = (0.0, max(0.8, pushes.hand_velocity[1]))
+    env.forces.pushes.hand_share = 0.5  # hands are what the law is for
     env.rewards.upper.reference_closeness = 1.0
     training.runner.iterations = 6103
     return training

@@ -17,7 +17,7 @@ def task_forces() -> ExternalForceConfig:
     """Loads on hands, and pushes on hands that an arm can give way to."""
     loads = HandLoadConfig(enabled=True, force_x=(-25.0, 25.0), force_y=(-25.0, 25.0), force_z=(-40.0, 0.0))
     pushes = PushConfig(
-        enabled=True, episode_share=1.0, hand_velocity=(0.15, 0.35), hand_share=1.0, link_share=0.0,
+        enabled=True, episode_share=1.0, velocity=(0.15, 0.35), hand_share=1.0, link_share=0.0,
         duration_s=(0.5, 1.0), interval_s=(1.5, 3.5),
     )  # fmt: skip
     return ExternalForceConfig(loads, pushes)

@@ -23,8 +23,8 @@ class CommandConfig:
     """Leftward velocity [m/s]."""
     yaw_rate: tuple[float, float] = (-0.9, 0.9)
     """Turning rate, positive to the left [rad/s]."""
-    height_offset: tuple[float, float] = (-0.2, 0.0)
-    """Torso height relative to nominal while standing [m]."""
+    height_offset: tuple[float, float] = (-0.22, 0.02)
+    """Torso height relative to nominal while standing [m]; a robot that walks keeps nominal height."""
     stand_probability: float = 0.25
     """Share of commands that ask the robot to stand."""
     axis_zero_probability: float = 0.2
@@ -164,9 +164,7 @@ class CommandSource(Stateful):
         )
         velocity *= torch.rand(n, 3, generator=rng, device=rng.device) >= cfg.axis_zero_probability
         stand = (torch.rand(n, generator=rng, device=rng.device) < cfg.stand_probability).float()
-        offset = uniform(rng, *cfg.height_offset, n)
-        # Height is commanded in stance only; half of the stances are at nominal height.
-        offset *= stand * (torch.rand(n, generator=rng, device=rng.device) < 0.5)
+        offset = stand * uniform(rng, *cfg.height_offset, n)
         self._target[mask] = torch.cat(
             (velocity * (1.0 - stand).unsqueeze(1), torch.stack((stand, self._nominal + offset), 1)), 1
         )

@@ -24,15 +24,11 @@ class PushConfig:
     episode_share: float = 0.8
     """Share of the episodes that have pushes."""
     velocity: tuple[float, float] = (0.0, 1.0)
-    """Impulse on the base over the robot's mass, uniform [m/s]."""
-    hand_velocity: tuple[float, float] = (0.0, 0.6)
-    """The same on a hand."""
-    link_velocity: tuple[float, float] = (0.0, 0.5)
-    """The same on the centre of mass of any link."""
+    """Impulse over the robot's mass, uniform, wherever it acts [m/s]."""
     hand_share: float = 0.3
     """Share of the pushes that hit a hand."""
-    link_share: float = 0.2
-    """Share of the pushes that hit a link drawn from all; the rest hit the base."""
+    link_share: float = 0.3
+    """Share of the pushes that hit the centre of mass of a link drawn from all; the rest hit the base."""
     duration_s: tuple[float, float] = (0.04, 0.12)
     """How long a push lasts, uniform [s]."""
     interval_s: tuple[float, float] = (2.0, 6.0)
@@ -42,7 +38,7 @@ class PushConfig:
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
-        for name in ("velocity", "hand_velocity", "link_velocity", "duration_s", "interval_s"):
+        for name in ("velocity", "duration_s", "interval_s"):
             require_interval(f"pushes.{name}", getattr(self, name))
             require_range(f"pushes.{name}[0]", getattr(self, name)[0], 0.0, 1e3)
         require_range("pushes.duration_s[0]", self.duration_s[0], 1e-3, 10.0)
@@ -104,14 +100,12 @@ class Pushes(Stateful):
         cfg, n = self.cfg, int(mask.sum())
         yaw, pitch = uniform(rng, -math.pi, math.pi, n), uniform(rng, -_LARGEST_PITCH_RAD, _LARGEST_PITCH_RAD, n)
         direction = torch.stack((pitch.cos() * yaw.cos(), pitch.cos() * yaw.sin(), pitch.sin()), -1)
-        kind, size = torch.rand(n, generator=rng, device=rng.device), uniform(rng, 0.0, 1.0, n)
+        kind = torch.rand(n, generator=rng, device=rng.device)
         hand = torch.randint(1, 1 + self._num_hands, (n,), generator=rng, device=rng.device)
         link = torch.randint(self._num_links, (n,), generator=rng, device=rng.device) + 1 + self._num_hands
         on_hand, on_link = kind < cfg.hand_share, kind >= 1.0 - cfg.link_share
         self.place[mask] = torch.where(on_hand, hand, torch.where(on_link, link, torch.zeros_like(hand)))
-        ranges = torch.tensor([cfg.velocity, cfg.hand_velocity, cfg.link_velocity], device=rng.device)
-        low, high = ranges[on_hand.long() + 2 * on_link.long()].unbind(1)
-        impulse = share * self._mass * torch.lerp(low, high, size)
+        impulse = share * self._mass * uniform(rng, *cfg.velocity, n)
         duration = uniform(rng, *cfg.duration_s, n)
         self.force_w[mask] = direction * (impulse / duration).unsqueeze(1)
         self._left_s[mask] = duration

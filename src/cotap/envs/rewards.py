@@ -175,15 +175,10 @@ class LowerRewards:
         """Yaw rate averaged over about half a stride."""
         return torch.exp(-s.mean_error[:, 2].square() / 0.02)
 
-    @term(0.75)
+    @term(3.0)
     def track_height(s: StepRecord) -> torch.Tensor:
-        """Height of the torso link against its command, narrow kernel."""
-        return torch.exp(-(s.command.height - s.state.height).square() / 0.0025)
-
-    @term(0.4)
-    def track_height_widely(s: StepRecord) -> torch.Tensor:
-        """Height of the torso link against its command, wide kernel: a direction to follow from 0.2 m away."""
-        return torch.exp(-(s.command.height - s.state.height).square() / 0.04)
+        """Height of the torso link against its command; a pointed kernel, steep near and far."""
+        return torch.exp(-10.0 * (s.command.height - s.state.height).abs())
 
     @term(0.75)
     def capture_point(s: StepRecord) -> torch.Tensor:
