@@ -177,8 +177,13 @@ class LowerRewards:
 
     @term(3.0)
     def track_height(s: StepRecord) -> torch.Tensor:
-        """Height of the torso link against its command; a pointed kernel, steep near and far."""
-        return torch.exp(-10.0 * (s.command.height - s.state.height).abs())
+        """Height of the torso link against its command, narrow kernel."""
+        return torch.exp(-(s.command.height - s.state.height).square() / 0.0025)
+
+    @term(1.6)
+    def track_height_widely(s: StepRecord) -> torch.Tensor:
+        """Height of the torso link against its command, wide kernel: a direction to follow from 0.2 m away."""
+        return torch.exp(-(s.command.height - s.state.height).square() / 0.04)
 
     @term(0.75)
     def capture_point(s: StepRecord) -> torch.Tensor:
