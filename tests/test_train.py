@@ -637,11 +637,10 @@ def test_the_quick_pipeline_is_a_small_version_of_both(tmp_path: Path, monkeypat
 
 def test_the_pipelines_first_stage_may_have_another_recipe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     tiny_networks(monkeypatch)
-    assert run("--base-recipe", "tour", *BOTH, RUN_DIR, tmp_path) == 0
-    pushes = newest(tmp_path / "base")["config"]["training"]["env"]["forces"]["pushes"]
-    assert (pushes["link_share"], pushes["link_velocity"]) == (0.4, pushes["velocity"])
-    pushes = newest(tmp_path / "distill")["config"]["training"]["env"]["forces"]["pushes"]
-    assert (pushes["hand_share"], pushes["hand_velocity"]) == (0.5, pushes["velocity"])  # no weaker than the base's
+    assert run("--base-recipe", "facet", *BOTH, RUN_DIR, tmp_path) == 0
+    for stage in ("base", "distill"):
+        rewards = newest(tmp_path / stage)["config"]["training"]["env"]["rewards"]["upper"]
+        assert (rewards["track_hands_as_facet"], rewards["track_key_points"]) == (1.3, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -650,8 +649,8 @@ def test_the_pipelines_first_stage_may_have_another_recipe(tmp_path: Path, monke
         ([ENVS, 0], "num_envs"),
         (["--base-iterations", -1], "base_iterations"),
         ([THREADS, -1], "threads"),
-        (["--base-recipe", "fast"], "default, facet, paper, quick, tour"),
-        (["--quick", "--base-recipe", "tour"], "--base-recipe 'tour'"),
+        (["--base-recipe", "fast"], "default, facet, paper, quick"),
+        (["--quick", "--base-recipe", "paper"], "--base-recipe 'paper'"),
     ],
 )
 def test_bad_options_of_both_stages_are_named(options: list[Any], needle: str, capsys: pytest.CaptureFixture[str]):

@@ -460,7 +460,7 @@ def test_smallest_sizes_that_are_allowed_learn_finite_parameters():
 
 
 def test_spread_is_limited_more_and_more():
-    learner = make_learner(initial_std=0.8, std_half_life=2.0, least_std=0.3)
+    learner = make_learner(num_envs=10, steps=5, initial_std=0.8, std_half_life=100.0, least_std=0.3)
     largest = []
     for _ in range(5):
         with torch.no_grad():
@@ -470,9 +470,9 @@ def test_spread_is_limited_more_and_more():
         learner.update()
         largest.append(float(learner.model.log_std["lower"].exp().max()))
     assert largest == pytest.approx([0.8 * 0.5**0.5, 0.4, 0.3, 0.3, 0.3])
-    again = make_learner(initial_std=0.8, std_half_life=2.0, least_std=0.3)
+    again = make_learner(num_envs=10, steps=5, initial_std=0.8, std_half_life=100.0, least_std=0.3)
     again.load_state_dict(learner.state_dict())
-    assert again.iterations == 5
+    assert (again.iterations, again.samples) == (5, 250)
 
 
 def test_trained_networks_go_on_slowly():

@@ -8,6 +8,7 @@ import pytest
 import torch
 from env_tools import NOMINAL, drive, hold_still, knock_over, mujoco_of, zeros
 
+from cotap.envs.record import height_slope
 from cotap.envs.rewards import UpperRewards
 
 EPS = 1e-4
@@ -184,3 +185,13 @@ def test_arm_poses_of_the_h1_have_elbows_at_the_forearm(make_env):
     points, _ = env.recorder._key_points(arms, torch.zeros(1, 2, 4))
     forearm = points[0, :2] - points[0, 2:]
     torch.testing.assert_close(forearm, torch.tensor([[0.3, 0.0, 0.0]] * 2), atol=1e-5, rtol=0)
+
+
+def test_the_height_slope_is_numpys_regression_over_standing_robots():
+    generator = np.random.default_rng(0)
+    commanded, noise = generator.uniform(0.8, 1.0, 200), generator.normal(0.0, 0.02, 200)
+    stand = generator.random(200) < 0.4
+    measured = np.where(stand, 0.3 + 0.7 * commanded + noise, 5.0)  # what walks does not count
+    slope = height_slope(*(torch.tensor(values) for values in (measured, commanded, stand.astype(float))))
+    assert float(slope) == pytest.approx(np.polyfit(commanded[stand], measured[stand], 1)[0], rel=1e-6)
+    assert float(height_slope(torch.ones(3), torch.ones(3), torch.zeros(3))) == 0.0  # nobody stands

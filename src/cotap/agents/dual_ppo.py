@@ -35,8 +35,8 @@ class DualPPOConfig:
     """Hidden layers of every actor and critic."""
     initial_std: float = 0.6
     """Standard deviation of actions at the start."""
-    std_half_life: float = 3000.0
-    """Iterations in which the largest standard deviation allowed falls by half: wide at first, precise later."""
+    std_half_life: float = 74e6
+    """Samples in which the largest standard deviation allowed falls by half: wide at first, precise later."""
     least_std: float = 0.12
     """Where that fall ends."""
     steps: int = 24
@@ -84,16 +84,9 @@ class DualPPOConfig:
             require_positive_int(f"ppo.hidden[{i}]", width)
         for name in ("gamma", "upper_gamma", "lam"):
             require_range(f"ppo.{name}", getattr(self, name), 0.0, 1.0)
-        for name in (
-            "initial_std",
-            "least_std",
-            "std_half_life",
-            "clip",
-            "learning_rate",
-            "desired_kl",
-            "max_grad_norm",
-        ):
+        for name in ("initial_std", "least_std", "clip", "learning_rate", "desired_kl", "max_grad_norm"):
             require_range(f"ppo.{name}", getattr(self, name), 1e-8, 1e6)
+        require_range("ppo.std_half_life", self.std_half_life, 1.0, 1e15)
         for name in ("entropy", "value", "value_clip"):
             require_range(f"ppo.{name}", getattr(self, name), 0.0, 1e3)
 
@@ -177,7 +170,8 @@ class DualPPO:
         )
         self._kl = nn.Parameter(torch.zeros(1, device=device))
         self._step = 0
-        self.iterations = 0
+        self.iterations = self.samples = 0
+        self._samples_per_iteration = t * n * self.ranks.size
 
     def _autocast(self) -> torch.autocast:
         return torch.autocast(torch.device(self.device).type, torch.bfloat16, enabled=self.dtype == torch.bfloat16)
@@ -254,6 +248,7 @@ class DualPPO:
                     for key, value in stats.items():
                         sums[f"{name}/{key}"] = sums.get(f"{name}/{key}", torch.zeros(())) + value
         self.iterations += 1
+        self.samples += self._samples_per_iteration
         self._limit_std()
         count = {name: max(1, cfg.epochs * cfg.mini_batches - skipped[name]) for name in self.names}
         log = {key: float(value) / count[key.partition("/")[0]] for key, value in sums.items()}
@@ -268,7 +263,7 @@ class DualPPO:
     @torch.no_grad()
     def _limit_std(self) -> None:
         cfg = self.cfg
-        largest = max(cfg.least_std, cfg.initial_std * 0.5 ** (self.iterations / cfg.std_half_life))
+        largest = max(cfg.least_std, cfg.initial_std * 0.5 ** (self.samples / cfg.std_half_life))
         for log_std in self.model.log_std.values():
             log_std.clamp_(max=math.log(max(largest, 1e-8)))
 
@@ -320,11 +315,12 @@ class DualPPO:
         self.learning_rates = dict.fromkeys(self.names, LOWEST_RATE)
 
     def state_dict(self) -> dict[str, Any]:
-        """Optimisers, learning rates and number of updates; the networks are saved apart."""
+        """Optimisers, learning rates, numbers of iterations and samples; the networks are saved apart."""
         return {
             "optimizers": {name: opt.state_dict() for name, opt in self.optimizers.items()},
             "learning_rates": dict(self.learning_rates),
             "iterations": self.iterations,
+            "samples": self.samples,
             "guide": self.guide.state_dict() if self.guide else {},
         }
 
@@ -340,6 +336,6 @@ class DualPPO:
             name: require_range(f"learning_rates.{name}", state["learning_rates"][name], 0.0, 1.0)
             for name in self.names
         }
-        self.iterations = int(state["iterations"])
+        self.iterations, self.samples = int(state["iterations"]), int(state["samples"])
         if self.guide and state["guide"]:
             self.guide.load_state_dict(state["guide"])

@@ -66,7 +66,7 @@ def _after_base(training: DistillTraining, base: BaseTraining) -> None:
     env = training.env
     env.assist = AssistConfig()
     env.forces.pushes.ramp, env.forces.hand_loads.ramp = RampConfig(), RampConfig()
-    halvings = base.runner.iterations / base.ppo.std_half_life
+    halvings = base.runner.iterations * base.ppo.steps * base.env.num_envs / base.ppo.std_half_life
     training.ppo.initial_std = max(base.ppo.least_std, base.ppo.initial_std * 0.5**halvings)
 
 

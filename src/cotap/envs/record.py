@@ -113,13 +113,13 @@ def step_log(r: StepRecord, time_out: torch.Tensor, ok: torch.Tensor | slice, dt
         "/command/slope_x": slope[0],
         "/command/slope_y": slope[1],
         "/command/slope_yaw": slope[2],
-        "/command/slope_height": _height_slope(s.height[ok], c.height[ok], c.stand[ok]),
+        "/command/slope_height": height_slope(s.height[ok], c.height[ok], c.stand[ok]),
         "/episode/falls_per_s": r.fell.float().mean() / dt,
         "/episode/time_outs_per_s": time_out.float().mean() / dt,
     }
 
 
-def _height_slope(measured: torch.Tensor, commanded: torch.Tensor, stand: torch.Tensor) -> torch.Tensor:
+def height_slope(measured: torch.Tensor, commanded: torch.Tensor, stand: torch.Tensor) -> torch.Tensor:
     """Regression of measured on commanded height (N,) over the robots that are asked to stand."""
     share = stand / stand.sum().clamp_min(1.0)
     about = commanded - (share * commanded).sum()

@@ -1,10 +1,11 @@
-"""Worlds on a GPU: MuJoCo Warp, float32, the whole physics step as one graph. Needs the extra `warp`."""
+"""Worlds on a GPU: MuJoCo Warp, float32, what it computes as graphs. Needs the extra `warp`."""
 
 from __future__ import annotations
 
 # Warp's arrays and MuJoCo's enumerations have no type stubs.
 # pyright: reportAttributeAccessIssue=false, reportArgumentType=false
 import copy
+from collections.abc import Callable
 
 import mujoco
 import mujoco_warp as mjw
@@ -56,32 +57,35 @@ class WarpSimulation(Simulation):
             for name in ("qpos", "qvel", "ctrl", "xfrc_applied", "sensordata", "qacc_warmstart")
         )
         self._fields = {name: wp.to_torch(getattr(self._model, name)) for name in fields}
-        self._graph = self._capture()
+        self._graphs = {work: self._capture(work) for work in (mjw.step, mjw.forward)}
 
     def update_constants(self) -> None:
         """Recompute what MuJoCo derives from masses and inertias, per env. Call after writing such fields."""
         with wp.ScopedDevice(self._place):
             mjw.set_const(self._model, self._data)
 
-    def _capture(self) -> wp.Graph | None:
-        """The physics step as a CUDA graph, launched with one call; none on the CPU."""
-        # What a step allocates on the way must come from a memory pool to be part of a graph.
+    def _capture(self, work: Callable[[mjw.Model, mjw.Data], None]) -> wp.Graph | None:
+        """`work` as a CUDA graph, launched with one call instead of hundreds; none on the CPU."""
+        # What it allocates on the way must come from a memory pool to be part of a graph.
         if not (self._place.is_cuda and wp.is_mempool_enabled(self._place)):
             return None
         with wp.ScopedDevice(self._place):
-            mjw.step(self._model, self._data)  # compiles, which a capture must not
+            work(self._model, self._data)  # compiles, which a capture must not
             with wp.ScopedCapture() as capture:
-                mjw.step(self._model, self._data)
+                work(self._model, self._data)
             mjw.reset_data(self._model, self._data)
         return capture.graph
 
-    def _advance(self) -> None:
+    def _run(self, work: Callable[[mjw.Model, mjw.Data], None]) -> None:
         # Warp's stream waits for torch's default one, and that for Warp's, as CUDA's blocking streams do.
         with wp.ScopedDevice(self._place):
-            if self._graph:
-                wp.capture_launch(self._graph)
+            if graph := self._graphs[work]:
+                wp.capture_launch(graph)
             else:
-                mjw.step(self._model, self._data)
+                work(self._model, self._data)
+
+    def _advance(self) -> None:
+        self._run(mjw.step)
 
     def _clear(self, mask: torch.Tensor) -> None:
         with wp.ScopedDevice(self._place):
@@ -90,8 +94,7 @@ class WarpSimulation(Simulation):
     def _forward(self, mask: torch.Tensor) -> None:
         # Warp moves all envs forward; what others had of the step before is put back.
         kept = [(tensor, tensor.clone()) for tensor in (self.sensors, self._warm_start)]
-        with wp.ScopedDevice(self._place):
-            mjw.forward(self._model, self._data)
+        self._run(mjw.forward)
         for tensor, before in kept:
             tensor.copy_(torch.where(mask.unsqueeze(1), tensor, before))
 
