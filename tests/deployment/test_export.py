@@ -108,7 +108,7 @@ def test_metadata_says_what_each_term_of_the_observation_is(robot, random_checkp
     assert all(entry["what"] and entry["unit"] in ("rad", "rad/s", "m", "m/s", "Nm", "1") for entry in about.values())
     # The height is that of the torso link above the ground, not an offset.
     lowest, highest = about["command_height"]["range"]
-    assert (lowest, highest) == pytest.approx((spec.nominal_height_m + c.height_offset[0], spec.nominal_height_m))
+    assert (lowest, highest) == pytest.approx([spec.nominal_height_m + offset for offset in c.height_offset])
     assert about["command_velocity"]["range"] == [
         [c.velocity_x[0], c.velocity_y[0]],
         [c.velocity_x[1], c.velocity_y[1]],
