@@ -563,12 +563,15 @@ def test_going_on_from_an_older_checkpoint_beside_newer_ones_is_refused(tmp_path
 def test_a_run_that_is_at_its_end_says_so_and_leaves_its_checkpoint(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     make_runner(tmp_path, 2).learn()
     before = checkpoint(tmp_path, 2).read_bytes()
+    there = names(tmp_path)
+    tmp_path.joinpath(".checkpoint_000000.abc.pt").write_bytes(b"killed while it shed its simulator states")
     ended = make_runner(tmp_path, 2)
     ended.load(str(checkpoint(tmp_path, 2)))
     ended.learn()
     said = capsys.readouterr()
     assert "at iteration 2 of 2: nothing to do" in said.out + said.err
     assert checkpoint(tmp_path, 2).read_bytes() == before
+    assert names(tmp_path) == there
 
 
 def test_a_new_run_directory_is_made_and_left_empty(tmp_path: Path):

@@ -152,7 +152,7 @@ def test_a_small_comparison_is_written_whole(shipped_file, tmp_path, monkeypatch
     load = result["engines"]["mujoco"]["periodic-load"]["arms"]["right"]
     assert load["elbow_torque_nm"] == pytest.approx(load["elbow_torque_statics_nm"], rel=0.1)
     moved = result["engines"]["mujoco"]["constant-load"]["PD"]["displacement_z"]["mean"]
-    assert -0.1 < moved < 0.0  # by how much is the policy's business: its arms' agent takes up a part of the load
+    assert abs(moved) < 0.1  # how far, and whether at all, is the policy's business: its arms' agent takes up the load
     assert "| late | 0 of 1" in (tmp_path / "report.md").read_text()
     assert (tmp_path / "report.png").read_bytes().startswith(b"\x89PNG")
     # Again, from what was kept; with another seed, anew.

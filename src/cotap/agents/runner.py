@@ -146,6 +146,8 @@ class DualRunner(OnPolicyRunner):
         self._stop = False
         first = self.current_learning_iteration
         last = self.runner_cfg.iterations if num_learning_iterations is None else first + num_learning_iterations
+        if ranks.leads:
+            remove_leftovers(self.run_dir)  # also of a run that was killed after its last save
         if first >= last:
             say(f"at iteration {first} of {last}: nothing to do; --iterations says how many in all")
             return
@@ -154,7 +156,6 @@ class DualRunner(OnPolicyRunner):
         ranks.same_everywhere(alg.model)
         run_log = None
         if ranks.leads:
-            remove_leftovers(self.run_dir)
             write_json(self.run_dir / "config.json", self.config)
             run_log = RunLog(self.run_dir, env.samples)  # pyright: ignore[reportAttributeAccessIssue]
             precision = str(alg.dtype).removeprefix("torch.")
