@@ -16,6 +16,7 @@ from cotap.agents.actors import AgentLayout, DualActorCritic, Observations
 from cotap.agents.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
 from cotap.agents.dual_ppo import DualPPO, DualPPOConfig
 from cotap.agents.heads import Head, SymmetricHead
+from cotap.agents.parity import Parity
 from cotap.agents.runner import layout_of
 from cotap.evaluation.policy import load_policy
 from cotap.reflection import Reflection, Symmetry, join
@@ -53,8 +54,9 @@ def test_mirrored_inputs_give_mirrored_outputs(hidden: tuple[int, ...]):
     head = SymmetricHead(SWAP, SWAP, hidden, 1.0)
     torch.nn.init.normal_(head.output_bias)
     x = torch.randn(7, 3)
-    assert head(x).std() > 0.1
-    torch.testing.assert_close(head(SWAP(x)), SWAP(head(x)))
+    split = head.parity
+    assert head(split(x)).std() > 0.1
+    torch.testing.assert_close(head(split(SWAP(x))), SWAP(head(split(x))))
 
 
 def test_one_hidden_pair_by_hand():
@@ -68,7 +70,32 @@ def test_one_hidden_pair_by_hand():
     silu = torch.nn.functional.silu
     a, b = silu(torch.tensor(1.0 + 4.0 + 1.5 + 0.25)), silu(torch.tensor(2.0 + 2.0 - 1.5 + 0.25))
     expected = torch.stack((a + 10.0 * b + 2.0, 10.0 * a + b + 2.0, 100.0 * (a - b)))
-    torch.testing.assert_close(head(torch.tensor([[1.0, 2.0, 3.0]]))[0], expected)
+    split = torch.tensor([[1.5, -0.5, 3.0]])  # (1 + 2) / 2; (1 - 2) / 2 and what is its own image's negative
+    torch.testing.assert_close(head(split)[0], expected)
+
+
+def test_the_even_part_is_kept_by_mirroring_and_the_odd_one_changes_sign():
+    """Columns 0 and 3 change places, 1 and 4 with another sign, too; 2 is its own image, 5 its own image's negative."""
+    reflection = Reflection(torch.tensor([3, 4, 2, 0, 1, 5]), torch.tensor([1.0, -1.0, 1.0, 1.0, -1.0, -1.0]))
+    split = Parity(reflection)
+    x = torch.tensor([[1.0, 10.0, 100.0, 3.0, 30.0, 300.0]])
+    torch.testing.assert_close(split(x), torch.tensor([[2.0, -10.0, 100.0, -1.0, 20.0, 300.0]]))
+    torch.testing.assert_close(split(reflection(x)), torch.tensor([[2.0, -10.0, 100.0, 1.0, -20.0, -300.0]]))
+    rng = torch.Generator().manual_seed(0)
+    weight, many = torch.randn(4, 6, generator=rng), torch.randn(5, 6, generator=rng)
+    even, odd = split.weights(weight)
+    assert (even.shape, odd.shape) == ((4, 3), (4, 3))
+    torch.testing.assert_close(split(many) @ torch.cat((even, odd), 1).T, many @ weight.T)
+
+
+def test_groups_are_read_as_if_they_were_split_together():
+    model = DualActorCritic(symmetric_layout(), (4,), 1.0).eval()
+    x = observations(5, 3)
+    groups = model.layout.obs_groups["critic"]
+    assert len(groups) == 2
+    together = torch.cat([model.normalizers[g](x[g]) for g in groups], 1)
+    expected = Parity(join([dummy_symmetry().observations[g] for g in groups]))(together)
+    torch.testing.assert_close(model.read("critic", model.normalize(x)), expected)
 
 
 def test_weights_start_as_those_of_a_plain_network():

@@ -12,6 +12,7 @@ from tensordict import TensorDict
 from torch import nn
 
 from cotap.agents.heads import Head, SymmetricHead
+from cotap.agents.parity import Parity
 from cotap.checks import quoted
 from cotap.memory import require_memory
 from cotap.reflection import Reflection, Symmetry, join
@@ -86,6 +87,9 @@ class DualActorCritic(nn.Module):
         self.normalizers = nn.ModuleDict(
             {g: EmpiricalNormalization(layout.observation_widths[g]) for g in sorted(used)}
         )
+        self.parities = nn.ModuleDict()
+        if layout.symmetry:
+            self.parities.update({g: Parity(layout.symmetry.observations[g]) for g in self.normalizers})
         sizes = {name: s.stop - s.start for name, s in layout.action_slices.items()}
         self.actors = nn.ModuleDict({name: self._actor(name, hidden) for name in sizes})
         self.critics = nn.ModuleDict({name: self._critic(hidden) for name in sizes})
@@ -109,8 +113,13 @@ class DualActorCritic(nn.Module):
         return join([symmetry.observations[g] for g in self.layout.obs_groups[reader]])
 
     def normalize(self, observations: Observations) -> Observations:
-        """Every group by its own running mean and standard deviation."""
-        return {g: normalizer(observations[g]) for g, normalizer in self.normalizers.items()}
+        """What the networks read: every group, normalised by its own running mean and standard deviation, and split
+        into its even and its odd part where the networks are symmetric."""
+        return {g: self._normalized(g, observations) for g in self.normalizers}
+
+    def _normalized(self, group: str, observations: Observations) -> torch.Tensor:
+        value = self.normalizers[group](observations[group])
+        return self.parities[group](value) if self.layout.symmetry else value
 
     def update_normalizers(self, observations: Observations) -> None:
         """Learn from a batch of raw observations, and from their mirror images where the networks are symmetric:
@@ -122,9 +131,16 @@ class DualActorCritic(nn.Module):
             cast(EmpiricalNormalization, normalizer).update(value)
 
     def read(self, reader: str, normalized: Observations) -> torch.Tensor:
-        """Input (N, width) of the `actor` or `critic`."""
+        """Input (N, width) of the `actor` or `critic`, of what `normalize` returns."""
         groups = self.layout.obs_groups[reader]
-        return normalized[groups[0]] if len(groups) == 1 else torch.cat([normalized[g] for g in groups], -1)
+        if len(groups) == 1:
+            return normalized[groups[0]]
+        parts = [normalized[g] for g in groups]
+        if self.layout.symmetry:  # all even parts, then all odd ones
+            widths = [cast(Parity, self.parities[g]).even.numel() for g in groups]
+            halves = [x.tensor_split((width,), 1) for x, width in zip(parts, widths, strict=True)]
+            parts = [half for side in zip(*halves, strict=True) for half in side]
+        return torch.cat(parts, -1)
 
     def mean_action(self, normalized: Observations) -> torch.Tensor:
         """Deterministic action (N, A) of the joint policy."""
@@ -134,4 +150,4 @@ class DualActorCritic(nn.Module):
     def forward(self, observations: Observations) -> torch.Tensor:
         """Deterministic action (N, A) of raw observations: what is deployed. Needs only what actors read."""
         groups = self.layout.obs_groups["actor"]
-        return self.mean_action({g: self.normalizers[g](observations[g]) for g in groups})
+        return self.mean_action({g: self._normalized(g, observations) for g in groups})

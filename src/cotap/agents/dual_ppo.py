@@ -93,7 +93,7 @@ class DualPPOConfig:
 
 @dataclass
 class Rollout:
-    """What one iteration collects: T steps, N envs, G agents. Observations are stored normalised."""
+    """What one iteration collects: T steps, N envs, G agents. Observations are stored as the networks read them."""
 
     observations: Observations
     actions: torch.Tensor
@@ -236,8 +236,8 @@ class DualPPO:
         skipped = dict.fromkeys(self.names, 0)
         for _ in range(cfg.epochs):
             for ids in torch.randperm(total, device=self.device).chunk(cfg.mini_batches):
-                batch = {key: value[ids] for key, value in flat.items()}
-                inputs = {g: v[ids] for g, v in observations.items()}
+                batch = {key: value.index_select(0, ids) for key, value in flat.items()}
+                inputs = {g: v.index_select(0, ids) for g, v in observations.items()}
                 with self._autocast():
                     actor_in, critic_in = self.model.read("actor", inputs), self.model.read("critic", inputs)
                 for g, name in enumerate(self.names):

@@ -10,6 +10,7 @@ from rsl_rl.modules import MLP
 from torch import nn
 from torch.nn import functional
 
+from cotap.agents.parity import Parity
 from cotap.reflection import Reflection
 
 
@@ -35,10 +36,11 @@ class SymmetricHead(nn.Module):
     """An MLP that answers the mirror image of its input with the mirror image of its output, whatever its weights.
 
     Its hidden units come in pairs: what one computes of an input, the other computes of the mirror image. So half of
-    each weight matrix follows from the other half, and a pass costs what a plain network of the same width costs.
+    each weight matrix follows from the other half. The first layer, by far the largest, costs half of a plain one's:
+    both units of a pair are sums of the same two products, of the even and the odd part of the input.
 
     Args:
-        inputs: Mirror image of the input.
+        inputs: Mirror image of the input, before it is split into its even and its odd part.
         outputs: Mirror image of the output.
         hidden: Widths, even.
         output_gain: Scale of the output layer's initial weights.
@@ -47,8 +49,6 @@ class SymmetricHead(nn.Module):
         ValueError: a width is odd.
     """
 
-    input_index: torch.Tensor
-    input_sign: torch.Tensor
     output_index: torch.Tensor
     output_sign: torch.Tensor
 
@@ -57,9 +57,9 @@ class SymmetricHead(nn.Module):
         for i, width in enumerate(hidden):
             if width % 2:
                 raise ValueError(f"ppo.hidden[{i}] must be even for a symmetric network, got {width}")
-        for name, reflection in (("input", inputs), ("output", outputs)):
-            self.register_buffer(f"{name}_index", reflection.index, persistent=False)
-            self.register_buffer(f"{name}_sign", reflection.sign, persistent=False)
+        self.parity = Parity(inputs)
+        self.register_buffer("output_index", outputs.index, persistent=False)
+        self.register_buffer("output_sign", outputs.sign, persistent=False)
         widths = (inputs.index.numel(), *hidden)
         self.weights = nn.ParameterList([torch.empty(n // 2, m) for m, n in zip(widths, hidden, strict=False)])
         self.biases = nn.ParameterList([torch.empty(n // 2) for n in hidden])
@@ -72,9 +72,10 @@ class SymmetricHead(nn.Module):
         self.output_bias = nn.Parameter(torch.zeros(outputs.index.numel()))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """(N, inputs) to (N, outputs), float32."""
-        for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            image = self._mirror_input(weight) if i == 0 else weight.roll(weight.shape[1] // 2, 1)
+        """(N, inputs), as `Parity` splits them, to (N, outputs), float32."""
+        x = functional.silu(self._first_layer(x))
+        for weight, bias in zip(self.weights[1:], self.biases[1:], strict=True):
+            image = weight.roll(weight.shape[1] // 2, 1)
             x = functional.silu(functional.linear(x, torch.cat((weight, image)), torch.cat((bias, bias))))
         with torch.autocast(x.device.type, enabled=False):
             weight, bias = self.output_weight, self.output_bias
@@ -82,9 +83,13 @@ class SymmetricHead(nn.Module):
             bias = 0.5 * (bias + self._mirror_output(bias))
             return functional.linear(x.float(), torch.cat((weight, image), 1), bias)
 
-    def _mirror_input(self, weight: torch.Tensor) -> torch.Tensor:
-        return weight[:, self.input_index] * self.input_sign
+    def _first_layer(self, x: torch.Tensor) -> torch.Tensor:
+        even, odd = self.parity.weights(self.weights[0])
+        width = even.shape[1]
+        a = functional.linear(x[:, :width], even, self.biases[0])
+        b = functional.linear(x[:, width:], odd)
+        return torch.cat((a + b, a - b), 1)
 
     def _mirror_output(self, value: torch.Tensor) -> torch.Tensor:
         sign = self.output_sign
-        return value[self.output_index] * (sign.unsqueeze(1) if value.dim() == 2 else sign)
+        return value.index_select(0, self.output_index) * (sign.unsqueeze(1) if value.dim() == 2 else sign)
