@@ -73,6 +73,7 @@ def test_every_dependency_is_imported_somewhere():
     assert names([*PROJECT["dependencies"], "cotap[all,warp]"]) - by_others <= used
 
 
+@pytest.mark.slow
 def test_the_compliance_library_needs_torch_alone():
     others = names(["cotap[all,warp]"]) - {"numpy", "filelock"}  # torch imports these two itself where it finds them
     code = (

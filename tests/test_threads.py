@@ -9,6 +9,7 @@ import sys
 import pytest
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("own", "expected"), [(None, "20000"), ("7", "7")])
 def test_threads_of_torch_soon_stop_spinning_unless_told_otherwise(own, expected):
     """Before torch is loaded, which reads it only once."""

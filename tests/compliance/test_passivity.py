@@ -269,6 +269,7 @@ def test_an_optimised_exciter_gets_the_store_and_no_more(rng):
     assert best[-1] >= best[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wall", [10.0, 1e3, 1e5, 1e7])
 def test_contact_with_springs_from_soft_to_rigid(wall, rng):
     """What a wall has taken is in it, and what went into it came from the store, or from the push that began it."""
@@ -291,6 +292,7 @@ def test_power_is_limited_as_well(rng):
     assert float(result.level.min()) > 0.5  # it was the power that held it back, not the energy
 
 
+@pytest.mark.slow
 def test_what_is_left_of_the_task_when_the_store_is_empty():
     """The target is still held at the stiffness in force; softening passes, and stiffening once the hand is home."""
     empty = EnergyStore(first=0.1, floor=0.1, ceiling=0.6, damping_share=0.0)

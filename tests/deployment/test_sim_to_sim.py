@@ -252,6 +252,7 @@ def test_the_figure_draws_errors_from_the_onset_on_and_torques_about_statics(tmp
     close(kept[0])
 
 
+@pytest.mark.slow
 def test_trials_do_not_depend_on_the_number_of_processes(policy_file):
     wrong = Perturbations(drop=0.1)
     options = (UpperBodyConfig(), EngineConfig(timestep=0.01), wrong, SafetyConfig(), Scenario(0.1))

@@ -69,6 +69,7 @@ def test_a_spring_with_a_known_curl(arms, target, rng):
     torch.testing.assert_close(loop.asymmetry, torch.full_like(loop.asymmetry, expected), rtol=1e-4, atol=0)
 
 
+@pytest.mark.slow
 def test_laws_with_an_energy_give_nothing_away(arms, target, rng):
     for law in (
         LawConfig("pd"), LawConfig("hmc", SOFT, alpha=0.5),
@@ -81,6 +82,7 @@ def test_laws_with_an_energy_give_nothing_away(arms, target, rng):
         assert float(loop.asymmetry.max()) < 1e-4
 
 
+@pytest.mark.slow
 def test_stiffness_on_joint_errors_has_no_energy(arms, target, rng):
     """What is drawn one way is put in the other way, and grows as the area that the path goes around."""
     law = LawConfig("cotap", SOFT)

@@ -236,6 +236,7 @@ def test_a_push_on_the_base_is_on_no_hand(robot):
     assert not env.hand_force_w.any()
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_json_and_more_threads_the_same_figures(checkpoint, tmp_path):
     """Bit for bit with one number of threads; another may add in another order, and agrees within the intervals."""
     results = []

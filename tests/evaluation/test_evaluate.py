@@ -47,8 +47,8 @@ def test_hands_are_loaded_as_asked(loaded):
 
 @pytest.mark.parametrize(("option", "arms"), [([], "moving"), (["--motion", "none"], "held")])
 def test_results_say_whether_arms_move(checkpoints, robot, option, arms, capsys):
-    options = ("--num-envs", "2", "--episode-seconds", "6", "--threads", "1", "--hand-loads", *option)
-    result = evaluate(["velocity-tracking", "--checkpoint", str(checkpoints(robot)), *options])
+    options = ("--num-envs", "2", "--episode-seconds", "3", "--command-seconds", "2", "--threads", "1", "--hand-loads")
+    result = evaluate(["velocity-tracking", "--checkpoint", str(checkpoints(robot)), *options, *option])
     assert result["arms"] == arms
     assert f"velocity-tracking, pd, arms {arms}: " in capsys.readouterr().out
     assert result["settings"]["env"]["robot"] == robot
@@ -130,6 +130,7 @@ def test_the_tour_is_filmed_with_the_arms_as_they_were_evaluated(
     assert filmed[1].tolist() == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.1, -0.2, -0.3, 0.4])
 
 
+@pytest.mark.slow
 def test_a_held_load_is_filmed_from_its_start(tmp_path: Path, checkpoint: Path, monkeypatch: pytest.MonkeyPatch):
     filmed = []
     monkeypatch.setattr("cotap.evaluation.render.film_video", lambda _path, _env, film, _sheet: filmed.append(film))

@@ -87,6 +87,7 @@ def test_condition_numbers_are_those_of_mujocos_jacobian(model, spec):
             assert float(found[i, a]) == pytest.approx(expected, rel=1e-2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("error", "allowed"), [("joint", 0.12), ("task", 0.02)])
 def test_arms_alone_are_as_stiff_as_they_are_asked_to_be(error, allowed):
     protocol = Fidelity(num_envs=6, stiffness_values=(300.0,), displacement=0.01, pelvis="fixed")

@@ -44,6 +44,7 @@ def test_swing_measures_by_hand(spec):
     assert float(m["energy_left"][0]) == pytest.approx(0.1 * DT * float(t.arm_torque[50:450, 0, elbows[0]].abs().sum()))
 
 
+@pytest.mark.slow
 def test_a_slow_load_asks_for_the_same_torque_whatever_the_stiffness():
     """Fixed pelvis, compliant left arm, PD on the right: torques are those of statics, the left hand swings more."""
     protocol = PeriodicLoad(num_envs=1, pelvis="fixed", randomize=False, force=(0.0, 0.0, 10.0), periods=2)

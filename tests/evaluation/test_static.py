@@ -26,7 +26,7 @@ POSES = [
 
 
 def run(pose, stiffness, force, **laws):
-    protocol = StaticStiffness(num_envs=2, force=force, levels=2, arm_pose=pose, settle_seconds=12.0)
+    protocol = StaticStiffness(num_envs=2, force=force, levels=2, arm_pose=pose, settle_seconds=5.0)
     return measured(protocol, LawOptions(method="cotap", stiffness=(stiffness,), **laws))
 
 
@@ -85,7 +85,7 @@ def test_heavy_load(error, expected):
     """50 N on the left hand, 300 N/m along x and y, elbow at 0.3 rad, no torque limits: as another model of H1 gave."""
     n = 1 + len(expected)
     protocol = StaticStiffness(
-        num_envs=n, force=(0.0, 0.0, -1.0), levels=n, settle_seconds=8.0, torque_limit_scale=100.0, arm_pose=POSES[0]
+        num_envs=n, force=(0.0, 0.0, -1.0), levels=n, settle_seconds=5.0, torque_limit_scale=100.0, arm_pose=POSES[0]
     )
     env = prepared(protocol, LawOptions(method="cotap", stiffness=(300.0,), error=error, null_stiffness=25.0))
     for i, vertical in enumerate(expected, start=1):
@@ -99,8 +99,8 @@ def test_an_asked_for_table_by_axis(checkpoint, tmp_path, capsys):
     out = tmp_path / "static.json"
     arguments = ["static-stiffness", "--checkpoint", str(checkpoint), "--num-envs", "4", "--arm-pose", "0", "0", "0",
                  "0.3", "--method", "cotap", "--stiffness", "200", "400", "800", "--error", "task",
-                 "--force", "1", "-2", "4", "--levels", "3", "--threads", "1", "--json", str(out),
-                 "--plot", str(tmp_path / "p.png")]  # fmt: skip
+                 "--force", "1", "-2", "4", "--levels", "3", "--settle-seconds", "4", "--threads", "1", "--json",
+                 str(out), "--plot", str(tmp_path / "p.png")]  # fmt: skip
     assert main(arguments) == 0
     result = json.loads(out.read_text())
     stiffness = result["effective_stiffness"]
@@ -121,7 +121,7 @@ def test_the_right_arm_is_the_lefts_mirror_image():
 
 
 def run_hand(hand, force):
-    protocol = StaticStiffness(num_envs=2, force=force, levels=2, hand=hand, settle_seconds=4.0)
+    protocol = StaticStiffness(num_envs=2, force=force, levels=2, hand=hand, settle_seconds=2.0)
     return measured(protocol, LawOptions(method="cotap"))
 
 

@@ -104,6 +104,7 @@ def test_mujoco_needs_nothing_of_mjbatch_and_warp(model, monkeypatch):
     assert isinstance(make_simulation("mujoco", model, 2, 2, 1), BatchSimulation)
 
 
+@pytest.mark.slow
 def test_importing_cotap_loads_neither_mjbatch_nor_warp():
     code = "import sys, cotap.envs, cotap.train; print({'mjbatch', 'mujoco_warp', 'warp'} & {*sys.modules})"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)

@@ -156,6 +156,7 @@ def test_what_one_saved_the_other_goes_on_from_bit_for_bit(cpu_backends, rng):
     assert torch.equal(env.sim.snapshot().state, other.sim.snapshot().state)
 
 
+@pytest.mark.slow
 def test_an_evaluation_measures_the_same(cpu_backends, tmp_path):
     policy = str(save_random_policy(tmp_path / "policy.pt"))
     results = []
