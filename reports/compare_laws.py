@@ -78,7 +78,9 @@ class Static:
     """Downward displacement of the left hand under 10, 30 and 50 N downward, every law (paper, Table VI)."""
 
     checkpoint: str = ""
-    """Policy of the legs (pelvis free); by default the shipped CoTaP policy."""
+    """Policy (pelvis free); by default the shipped CoTaP policy."""
+    facet_checkpoint: str = ""
+    """Policy of the row facet; by default as the others."""
     pelvis: str = "free"
     """free or fixed."""
     stiffness: float = 500.0
@@ -115,7 +117,7 @@ class Static:
                 torque_limit_scale=self.torque_limit_scale,
             )  # fmt: skip
             laws = laws_of(name, self.stiffness, self.null_stiffness, self.sensing)
-            options = Options(protocol, laws, checkpoint=self.checkpoint, threads=self.threads)
+            options = Options(protocol, laws, checkpoint=policy_of(self, name), threads=self.threads)
             with redirect_stdout(StringIO()):  # its own table
                 result = run("static-stiffness", options)
             curve = result["curve"]
@@ -162,12 +164,19 @@ def _down(displacement: list[float | None]) -> float | None:
     return None if displacement[2] is None else -displacement[2]
 
 
+def policy_of(options: Static | Transient, name: str) -> str:
+    """The checkpoint of a row."""
+    return (options.facet_checkpoint if name == "facet" else "") or options.checkpoint
+
+
 @dataclass
 class Transient:
     """What a hand does after a push on it, every law (paper, Fig. 9): error over time, energy of its oscillation."""
 
     checkpoint: str = ""
-    """Policy of the legs; by default the shipped CoTaP policy."""
+    """Policy; by default the shipped CoTaP policy."""
+    facet_checkpoint: str = ""
+    """Policy of the row facet; by default as the others."""
     forces: tuple[float, ...] = (200.0, 500.0)
     """Along x on the left hand, for 50 ms [N]. The smaller leaves arms under PD and CoTaP below their torque limits."""
     stiffness: float = 500.0
@@ -175,7 +184,7 @@ class Transient:
     null_stiffness: float = LawConfig.null_stiffness
     """Stiffness of arm motion that leaves the hand where it is [Nm/rad]."""
     num_envs: int = 64
-    """Worlds per law and force."""
+    """Envs per law and force."""
     mode: str = "stance"
     """stance or walking."""
     pelvis: str = "free"
@@ -205,7 +214,7 @@ class Transient:
                     force=(force, 0.0, 0.0),
                 )  # fmt: skip
                 laws = laws_of(name, self.stiffness, self.null_stiffness)
-                options = Options(protocol, laws, checkpoint=self.checkpoint, threads=self.threads)
+                options = Options(protocol, laws, checkpoint=policy_of(self, name), threads=self.threads)
                 with redirect_stdout(StringIO()):  # its own table
                     result = run("impact", options)
                 kept = ("num_envs", "num_falls", "metrics", "window", "curve")

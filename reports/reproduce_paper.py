@@ -7,6 +7,7 @@ docs/results.md (H1) or docs/results_ROBOT.md is written, with docs/results/ROBO
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -70,7 +71,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         book = open_book(options)
     except (ValueError, OSError) as error:
         parser.error(str(error))
-    begin(book, options.only)
+    begin(book, sys.argv[1:] if argv is None else argv)
     for name, part in PARTS.items():
         if not options.only or name in options.only:
             part(book)
@@ -119,15 +120,11 @@ def given_policies(texts: Sequence[str]) -> dict[str, str]:
     return found
 
 
-def begin(book: Book, only: Sequence[str]) -> None:
-    """The head of the page."""
+def begin(book: Book, arguments: Sequence[str]) -> None:
+    """The head of the page, with the command that made it."""
     title = "The paper's tables and figures, measured here"
     book.add(f"# {title}" if book.robot == "h1" else f"# {title}, on {book.robot.upper()}")
-    command = " ".join(
-        ["python -m reports.reproduce_paper", f"--robot {book.robot}", *(["--quick"] if book.quick else []),
-         *(["--only", *only] if only else [])]
-    )  # fmt: skip
-    book.paragraph(HEAD, command=command, envs=book.envs)
+    book.paragraph(HEAD, command=shlex.join(["python", "-m", "reports.reproduce_paper", *arguments]), envs=book.envs)
     book.paragraph(IMPACT, robot=book.robot.upper())
     measured = (f"`{name}` ({samples(book, name)} M samples)" for name in book.policies if book.has(name))
     book.paragraph("Policies: {measured}.", measured=", ".join(measured) or "none of which there is a checkpoint")

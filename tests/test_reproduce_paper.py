@@ -209,7 +209,9 @@ def test_only_the_parts_that_are_asked_for_are_measured(tmp_path, monkeypatch):
     (book,) = ran
     assert (book.envs, book.reuse, book.threads) == (4096, True, 1)
     assert (book.policies["base"], book.policies["cotap"]) == ("g1-base", "g1-cotap")
-    assert (tmp_path / "runs/paper/results_g1.md").read_text().startswith("# The paper's tables and figures")
+    page = (tmp_path / "runs/paper/results_g1.md").read_text()
+    assert page.startswith("# The paper's tables and figures")
+    assert "`python -m reports.reproduce_paper --only impact --reuse --threads 1 --robot g1`: do not edit" in page
     assert json.loads((tmp_path / "runs/paper/results/g1/results.json").read_text())["robot"] == "g1"
 
 

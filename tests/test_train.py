@@ -629,6 +629,7 @@ def test_without_a_stage_both_run_and_are_summed_up(tmp_path: Path, monkeypatch:
 def test_the_quick_pipeline_is_a_small_version_of_both(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     assert PipelineOptions(quick=True).iterations() == (1220, 610)
     assert PipelineOptions().iterations() == (12_207, 6103)
+    assert PipelineOptions(num_envs=2048).iterations() == (6103, 3051)  # as many samples
     tiny_networks(monkeypatch)
     assert run("--quick", *BOTH, RUN_DIR, tmp_path) == 0
     for stage in ("base", "distill"):

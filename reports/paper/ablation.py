@@ -59,7 +59,7 @@ def ablation(book: Book) -> None:
         cotap=fell(book, "ablation-cotap"),
         push=change(book, "ablation-cotap", "ablation-base", "e_upper"),
         calm=change(book, "calm-cotap", "calm-base", "e_upper"),
-        trained=change(book, "calm-cotap", "calm-no-ratio", "e_upper"),
+        trained=change(book, "calm-seed-0" if book.has("seed-0") else "calm-cotap", "calm-no-ratio", "e_upper"),
         law=change(book, "calm-cotap", "calm-law-alone", "e_upper"),
     )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from reports.paper.book import Book
-from reports.paper.words import NOT_MEASURED, fallen, missing
+from reports.paper.words import NOT_MEASURED, fallen, missing, number
 
 ENVS = 384
 ALONE = ["--upper-actions", "reference"]
@@ -16,6 +16,11 @@ WHAT = """The paper has no such table. A robot stands; its left hand is loaded a
 of the one asked for. In a mean over poses, errors of both signs hide each other; single hands show them. Loads that
 take more than nine tenths of an arm's torque are not tried. Without the policy's arm actions the hand feels the law
 alone."""
+
+
+TRACKING = ["--method", "cotap", "--stiffness", "300", "--alpha", "1"]
+UPPER = """Moving references at K 300, random commands for 20 s: e_upper is {own} rad with the policy's arm actions, and
+{raw} rad with the raw reference as the arms' target."""
 
 
 def fidelity(book: Book) -> None:
@@ -38,6 +43,17 @@ def fidelity(book: Book) -> None:
             single_hands(result["error_quantiles"]), str(result["num_wrong_way"]), str(result["num_unholdable"]),
             fallen(result),
         )  # fmt: skip
+    upper_agent(book)
+
+
+def upper_agent(book: Book) -> None:
+    """What the arms' agent adds to the tracking of a moving reference."""
+    found = []
+    for options in ([], ALONE):
+        name = f"tracking-{'without' if options else 'with'}"
+        result = book.run(name, "cotap", "velocity-tracking", *TRACKING, *options)
+        found.append(missing("cotap") if result is None else number(result["metrics"]["e_upper"]))
+    book.paragraph(UPPER, own=found[0], raw=found[1])
 
 
 def worst(rows: list[dict[str, Any]], axis: str) -> str:

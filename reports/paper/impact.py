@@ -37,6 +37,9 @@ WALKING = """{paper} has errors of the torso of 2.1 m/s. A push of {impulse:g} N
 fall, or do not walk as commanded, would explain them. At K 100 ours have an error of {torso} m/s, robots that fell
 left out; {fell} % fell."""
 
+ANY_FORCE_N = (500.0, 1000.0)
+ANY_DIRECTION = """The push of 50 ms at the left hand has a random horizontal direction, arms following clips."""
+
 COMPARED = """By the 95 % intervals of the differences, env by env, from PD with the same policy and with the base.
 Where the answer is no, the measures that are not named are better."""
 
@@ -52,6 +55,7 @@ def impact(book: Book) -> None:
     book.add("", "## Impact (the paper's Table III)")
     for mode in MODES:
         measure_mode(book, mode)
+    any_direction(book)
     compare_with_pd(book)
     orderings(book)
     without_limits(book)
@@ -90,6 +94,21 @@ def measure_row(
     m = result["metrics_without_falls"]
     cells = [number(m[measure], DIGITS.get(measure, 3)) for measure in LABELS]
     return book.row(name, *cells, fallen(result), last=printed(paper))
+
+
+def any_direction(book: Book) -> None:
+    """Who falls, whatever the direction of the push, also of one twice as strong."""
+    book.add("", "### Falls, pushed in any direction")
+    book.paragraph(ANY_DIRECTION)
+    pushes = [(f"{mode}, {force * DURATION_S:g} N s", mode, force) for mode in MODES for force in ANY_FORCE_N]
+    book.table("arms, share that fell [%]", *(title for title, *_ in pushes))
+    for name, law in arms(book.robot).items():
+        found = []
+        for _, mode, force in pushes:
+            options = ["--mode", mode, "--random-direction", "--force", f"{force:g}", "0", "0", *law]
+            result = book.run(key(mode, name, f"any-{force:g}"), "cotap", "impact", *options)
+            found.append(missing("cotap") if result is None else fallen(result))
+        book.row(label(book.robot, name), *found)
 
 
 def stance(book: Book) -> None:

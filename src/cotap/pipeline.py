@@ -34,9 +34,9 @@ class PipelineOptions:
     num_envs: int = 1024
     """Number of envs."""
     base_iterations: int = 0
-    """Iterations of stage 1; 0 for the recipe's."""
+    """Iterations of stage 1; 0 for as many as the recipe's samples take."""
     distill_iterations: int = 0
-    """Iterations of stage 2; 0 for the recipe's."""
+    """Iterations of stage 2; 0 for as many as the recipe's samples take."""
     seed: int = 0
     """Seed of both stages."""
     threads: int = 0
@@ -78,8 +78,10 @@ class PipelineOptions:
         """Both configurations."""
         first, second = self.recipes
         base = BASE_RECIPES[first]()
+        samples = base.runner.iterations * base.ppo.steps * base.env.num_envs
         base.env.robot, base.env.num_envs, base.env.backend = self.robot, self.num_envs, self.backend
         base.env.num_threads = self.threads
+        base.train_for(samples)  # whatever the number of envs
         distill = DISTILL_RECIPES[second](base)
         base.runner.iterations = self.base_iterations or base.runner.iterations
         distill.runner.iterations = self.distill_iterations or distill.runner.iterations

@@ -58,8 +58,8 @@ class BaseOptions:
     """Checkpoint to go on from, or auto. auto takes the newest in --run-dir, if there is one. The configuration of the
     run is the default for every option."""
     recipe: str = "default"
-    """default, quick, paper, tour or facet. default is the full training, quick walks in the shortest time, paper has
-    the paper's values, tour pushes every link as hard as the base, facet tracks FACET's reward."""
+    """default, quick, paper or facet. default is the full training, quick walks in the shortest time, paper has the
+    paper's values, facet tracks FACET's reward."""
     command: tyro.conf.Suppress[str] = ""
     training: Annotated[BaseTraining, tyro.conf.arg(name="")] = field(default_factory=BASE_RECIPES["default"])
 

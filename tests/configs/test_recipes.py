@@ -204,6 +204,33 @@ def test_a_distillation_begins_with_what_its_base_ended_with():
     assert training.ppo.initial_std == training.ppo.least_std
 
 
+@pytest.mark.parametrize("num_envs", [512, 1024])
+@pytest.mark.parametrize(
+    ("names", "samples"),
+    [(["default"], 150e6), (["quick"], 15e6), (["no-ratio", "torque-critic", "goals", "facet"], 40e6)],
+)
+def test_recipes_ask_for_as_many_samples_whatever_the_number_of_envs(names: list[str], samples: float, num_envs: int):
+    base = BASE_RECIPES["default"]()
+    base.env.num_envs = num_envs
+    for name in names:
+        training = DISTILL_RECIPES[name](base)
+        asked = training.runner.iterations * training.ppo.steps * training.env.num_envs
+        assert asked == pytest.approx(samples, rel=2e-3)
+
+
+def test_facet_is_trained_on_unmoved_references_and_otherwise_as_cotap():
+    """Appendix D: its own reward in the place of key points; no law moves the reference in training."""
+    base = BASE_RECIPES["default"]()
+    base.env.rewards.upper.track_arms = 2.0
+    facet, cotap = (DISTILL_RECIPES[name](base) for name in ("facet", "no-ratio"))
+    assert facet.env.upper_body.left.name == facet.env.upper_body.right.name == "pd"
+    weights = cotap.env.rewards.upper
+    changed = {"track_key_points": 0.0, "track_key_velocities": 0.0, "track_hands_as_facet": 1.3}
+    assert to_plain(facet.env.rewards.upper) == to_plain(weights) | changed
+    assert weights.track_arms == 2.0
+    assert weights.reference_closeness == 1.0
+
+
 def test_a_modulated_policy_begins_in_the_middle_and_is_paid_for_the_task():
     """60 M samples; what does not give way to a push, or draws what the policy sets, is off."""
     training = DISTILL_RECIPES["modulated"](BASE_RECIPES["default"]())

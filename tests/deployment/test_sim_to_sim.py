@@ -33,7 +33,7 @@ from cotap.deployment.sim_to_sim import (
 from cotap.deployment.trial import Trial
 from cotap.deployment.workers import Workers
 from cotap.envs.upper_body import UpperBodyConfig
-from cotap.evaluation.disturbance import ConstantLoad
+from cotap.evaluation.disturbance import ConstantLoad, Impact
 from cotap.robots import RobotSpec
 from reports import sim_to_sim as script
 
@@ -57,7 +57,7 @@ def test_trials_that_fell_are_in_no_figure_of_the_hand(spec: RobotSpec, part: Ca
             return [stand(spec, down) for down in fell]
 
         if part is loads:
-            return loads(run, spec, protocol, Comparison())["PD"]
+            return loads(run, spec, protocol, Comparison(), UpperBodyConfig())["PD"]
         return periodic(run, spec, Comparison())
 
     one, two, none = result(False), result(False, True), result(True)
@@ -196,6 +196,25 @@ def test_parts_are_run_as_they_ask_and_otherwise_as_the_policy_was_trained(polic
     ]
     assert result["engines"] == {"mujoco": {"a": {"ran": []}, "b": {"ran": []}}}
     assert result["dt"] == policy.metadata.control_dt
+
+
+def test_loads_keep_what_the_policy_was_trained_with(spec, monkeypatch):
+    trained = UpperBodyConfig(LawConfig("cotap", null_stiffness=33.0, damping="pd"), LawConfig("cotap"))
+    trained.torso.model, trained.singularity_ratio = "constant", False
+    monkeypatch.setattr(sim_to_sim, "LAWS", {"K 500": "cotap:stiffness=500"})
+
+    class Asked(Exception):
+        pass
+
+    def run(scenario, count, laws, wrong):
+        del scenario, count, wrong
+        raise Asked(laws)
+
+    with pytest.raises(Asked) as asked:
+        loads(run, spec, Impact(), Comparison(), trained)
+    laws = asked.value.args[0]
+    assert laws.left == laws.right == LawConfig("cotap", (500.0,) * 3, 33.0, damping="pd")
+    assert (laws.torso.model, laws.singularity_ratio) == ("constant", False)
 
 
 def a_result() -> dict[str, Any]:

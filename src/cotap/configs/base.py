@@ -15,7 +15,7 @@ from cotap.agents.runner_config import RunnerConfig
 from cotap.checks import reason_of, require_range
 from cotap.envs.actions import ActionConfig
 from cotap.envs.commands import CommandConfig
-from cotap.envs.config import HumanoidEnvConfig, RewardConfig
+from cotap.envs.config import HumanoidEnvConfig
 from cotap.envs.curriculum import AssistConfig, RampConfig
 from cotap.envs.external_forces import ExternalForceConfig
 from cotap.envs.gait_phase import GaitConfig
@@ -38,6 +38,10 @@ class BaseTraining:
     env: HumanoidEnvConfig = field(default_factory=HumanoidEnvConfig)
     ppo: DualPPOConfig = field(default_factory=DualPPOConfig)
     runner: RunnerConfig = field(default_factory=RunnerConfig)
+
+    def train_for(self, samples: float) -> None:
+        """Set the iterations that take so many samples, with the envs and steps that are set now."""
+        self.runner.iterations = max(1, int(samples / (self.ppo.steps * self.env.num_envs)))
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
@@ -107,16 +111,14 @@ def paper() -> BaseTraining:
 def facet() -> BaseTraining:
     """FACET as the paper trains it: PD arms, its tracking reward on the data's own motion, no moving reference."""
     training = default()
-    training.env.rewards = RewardConfig(upper=facet_rewards())
+    track_as_facet(training.env.rewards.upper)
     return training
 
 
-def facet_rewards() -> UpperRewards:
-    """FACET's tracking reward of the hands in place of that of key points, at their weight."""
-    weights = UpperRewards()
+def track_as_facet(weights: UpperRewards) -> None:
+    """Put FACET's tracking reward of the hands in the place of that of key points, at their weight."""
     weights.track_hands_as_facet = weights.track_key_points + weights.track_key_velocities
     weights.track_key_points = weights.track_key_velocities = 0.0
-    return weights
 
 
 BASE_RECIPES: dict[str, Callable[[], BaseTraining]] = {

@@ -71,7 +71,7 @@ class Comparison:
     """Engines, by name."""
     trials: int = 100
     """Trials of velocity tracking."""
-    perturbed_trials: int = 20
+    perturbed_trials: int = 100
     """Trials of each perturbation."""
     load_trials: int = 4
     """Trials of each law under each load."""
@@ -132,13 +132,13 @@ def compare(path: Path, cfg: Comparison, jobs: int = 1, kept: Path | None = None
 
 def _parts(policy: OnnxPolicy, cfg: Comparison, run: Run) -> dict[str, Callable[[], dict[str, Any]]]:
     """Everything that is run in one engine, by name."""
-    spec = robot_of(policy.metadata)
+    spec, trained = robot_of(policy.metadata), law_config(policy.metadata)
     impact, load = Impact(onset=ONSET_S, episode_seconds=ONSET_S + 2.0), ConstantLoad(onset=ONSET_S)
     load.episode_seconds = ONSET_S + 4.0
     return {
         "velocity-tracking": lambda: tracking(run(Scenario(cfg.episode_seconds), cfg.trials), policy, cfg),
-        "impact": lambda: loads(run, spec, impact, cfg),
-        "constant-load": lambda: loads(run, spec, load, cfg),
+        "impact": lambda: loads(run, spec, impact, cfg, trained),
+        "constant-load": lambda: loads(run, spec, load, cfg, trained),
         "periodic-load": lambda: periodic(run, spec, cfg),
         "perturbations": lambda: {
             label: falls(run(Scenario(cfg.episode_seconds), cfg.perturbed_trials, wrong=wrong))
@@ -175,14 +175,14 @@ def tracking(trials: list[Trial], policy: OnnxPolicy, cfg: Comparison) -> dict[s
     return falls(trials) | {"metrics": {name: summarize(measures[name], cfg.seed) for name in names}}
 
 
-def loads(run: Run, spec: RobotSpec, protocol: Impact, cfg: Comparison) -> dict[str, Any]:
-    """An impact or a held load on the left hand, standing, law by law."""
+def loads(run: Run, spec: RobotSpec, protocol: Impact, cfg: Comparison, trained: UpperBodyConfig) -> dict[str, Any]:
+    """An impact or a held load on the left hand, standing, law by law; all else of the arms is as `trained`."""
     out: dict[str, Any] = {}
     force = ForceProfile(protocol.force, protocol.hand, protocol.onset, protocol.duration)
     scenario = Scenario(protocol.seconds, command=STAND, force=(force,))
     for label, text in LAWS.items():
-        law = parse_law("left", text, LawConfig())
-        trials = run(scenario, cfg.load_trials, UpperBodyConfig(law, replace(law)), APART)
+        law = parse_law("left", text, trained.left)
+        trials = run(scenario, cfg.load_trials, replace(trained, left=law, right=replace(law)), APART)
         t = _trajectory(trials, protocol.seconds)
         begin, first, last = (round((protocol.onset + s) / t.dt) for s in (0.0, *protocol.window))
         hit = [i for i, arm in enumerate(spec.arms) if protocol.hand in (arm.side, "both")]

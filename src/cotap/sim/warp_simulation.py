@@ -1,4 +1,4 @@
-"""Worlds on a GPU: MuJoCo Warp, float32, what it computes as graphs. Needs the extra `warp`."""
+"""Envs on a GPU: MuJoCo Warp, float32, what it computes as graphs. Needs the extra `warp`."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def _warp_device(device: str) -> wp.Device:
 
 
 def _supported(model: mujoco.MjModel) -> mujoco.MjModel:
-    """`model` less the flag that Warp does not know because it never restarts worlds by itself."""
+    """`model` less the flag that Warp does not know because it never restarts envs by itself."""
     model = copy.copy(model)
     model.opt.disableflags &= ~mujoco.mjtDisableBit.mjDSBL_AUTORESET.value
     return model
