@@ -31,6 +31,24 @@ def guided(base: DualActorCritic, cfg: DistillationConfig, **ppo: Any) -> DualPP
     return DualPPO(layout_of(DummyEnv(8)), 8, DualPPOConfig(**(TINY | ppo)), guide=Guide(base, cfg))
 
 
+def test_a_policy_begins_as_the_base_but_for_agents_that_begin_anew():
+    base = base_policy()
+    learner = guided(base, DistillationConfig(anew=("upper",)))
+    learner.guide.start(learner.model)
+    x = {"policy": torch.randn(8, 6)}
+    begun, wanted = learner.model(x), base(x)
+    assert torch.equal(begun[:, SLICES["lower"]], wanted[:, SLICES["lower"]])
+    assert wanted[:, SLICES["upper"]].abs().max() > 0.1
+    assert not begun[:, SLICES["upper"]].any()
+    hidden = learner.model.actors["upper"].mlp[0].weight
+    assert torch.equal(hidden, base.actors["upper"].mlp[0].weight)
+
+
+def test_an_agent_that_is_not_there_cannot_begin_anew():
+    with pytest.raises(ValueError, match=r"distillation\.anew 'arms' is unknown"):
+        DistillationConfig(anew=("arms",)).check()
+
+
 def test_weight_falls_linearly_to_zero():
     guide = Guide(base_policy(), DistillationConfig(beta=0.8, end_iterations=10))
     assert [guide.beta(i) for i in (0, 5, 10, 99)] == pytest.approx([0.8, 0.4, 0.0, 0.0])

@@ -107,6 +107,15 @@ def test_weights_start_as_those_of_a_plain_network():
     torch.testing.assert_close(symmetric.output_weight @ symmetric.output_weight.T, 1e-4 * torch.eye(3))
 
 
+def test_a_head_that_shall_answers_zero_and_learns_from_there():
+    head = SymmetricHead(SWAP, SWAP, (8, 4), 1.0)
+    torch.nn.init.normal_(head.output_bias)
+    head.answer_zero()
+    assert not head(torch.randn(5, 3)).any()
+    head(torch.randn(5, 3)).sum().backward()
+    assert head.output_weight.grad.abs().max() > 0.0
+
+
 def test_an_odd_width_is_refused():
     with pytest.raises(ValueError, match=r"hidden\[1\] must be even for a symmetric network, got 7"):
         SymmetricHead(SWAP, SWAP, (8, 7), 1.0)

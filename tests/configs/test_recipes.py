@@ -231,6 +231,17 @@ def test_facet_is_trained_on_unmoved_references_and_otherwise_as_cotap():
     assert weights.reference_closeness == 1.0
 
 
+@pytest.mark.parametrize(
+    ("base", "name", "anew"),
+    [
+        ("default", "default", ("upper",)), ("default", "no-ratio", ("upper",)), ("default", "facet", ()),
+        ("default", "paper", ()), ("default", "modulated", ()), ("paper", "default", ()),
+    ],
+)  # fmt: skip
+def test_arms_begin_at_their_reference_where_a_zero_action_asks_for_it(base: str, name: str, anew: tuple[str, ...]):
+    assert DISTILL_RECIPES[name](BASE_RECIPES[base]()).distillation.anew == anew
+
+
 def test_a_modulated_policy_begins_in_the_middle_and_is_paid_for_the_task():
     """60 M samples; what does not give way to a push, or draws what the policy sets, is off."""
     training = DISTILL_RECIPES["modulated"](BASE_RECIPES["default"]())

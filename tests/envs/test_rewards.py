@@ -83,6 +83,7 @@ def perfect() -> StepRecord:
         fell=torch.tensor([False]),
         hand_force_w=torch.zeros(1, 1, 3),
         hand_push_w=torch.zeros(1, 1, 3),
+        compliant_arms=torch.tensor([[False]]),
         scales=SCALES,
     )
 
@@ -102,6 +103,44 @@ def changed(**changes) -> StepRecord:
             field = next(f for f in ("state", "command", "reference") if getattr(record, f) is holder)
             record = dataclasses.replace(record, **{field: new})
     return record
+
+
+def two_arms(forced: tuple[bool, bool], compliant: tuple[bool, bool]) -> StepRecord:
+    """The perfect step of a robot with an arm to each upper joint: joints off by 0.1 and 0.3 rad, hands by 0.1 and
+    0.2 m and 1 and 2 m/s, elbows by nothing and 0.1 m; forces on some hands, compliance on some arms."""
+    off = torch.tensor([[[0.1, 0.0, 0.0], [0.0, 0.2, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.1]]])
+    speed = torch.tensor([[[1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]])
+    force = 5.0 * torch.tensor([forced]).unsqueeze(2).expand(1, 2, 3)
+    still = dataclasses.replace(perfect().state, torso_angular_velocity_t=torch.zeros(1, 3))
+    return dataclasses.replace(
+        perfect(), state=dataclasses.replace(still, joint_pos=torch.tensor([[0.1, -0.2, 0.3, 0.1, 0.3]])),
+        key_points_t=off, key_points_reference_t=torch.zeros(1, 4, 3), key_velocities_t=speed,
+        key_velocities_reference_t=torch.zeros(1, 4, 3), hand_force_w=force, hand_push_w=torch.zeros(1, 2, 3),
+        compliant_arms=torch.tensor([compliant]),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("forced", "compliant", "counted"),
+    [
+        ((False, False), (True, True), (1, 1)),
+        ((True, False), (True, True), (0, 1)),
+        ((True, True), (True, True), (0, 0)),
+        ((True, True), (False, True), (1, 0)),
+        ((True, True), (False, False), (1, 1)),
+    ],
+)
+def test_a_compliant_arm_under_a_force_is_not_asked_to_be_at_its_reference(forced, compliant, counted):
+    """Of such an arm nothing counts; of the other, all."""
+    record = two_arms(forced, compliant)
+    left, right = counted
+    expected = {
+        "track_arms": math.exp(-(0.01 * left + 0.09 * right) / 0.06),
+        "track_key_points": math.exp(-(0.01 * left + (0.04 + 0.01) * right) / 0.01),
+        "track_key_velocities": math.exp(-(1.0 * left + 4.0 * right)),
+    }
+    for name, value in expected.items():
+        assert float(UpperRewards.TERMS[name].function(record)) == pytest.approx(value, rel=1e-5), name
 
 
 AT_REST = {"velocity_h": [[0.0, 0.0]], "torso_linear_velocity_h": [[0.0, 0.0, 0.0]]}

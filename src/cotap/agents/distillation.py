@@ -5,11 +5,12 @@ from __future__ import annotations
 import copy
 import hashlib
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import torch
 
 from cotap.agents.actors import DualActorCritic, Observations
+from cotap.agents.heads import Head, SymmetricHead
 from cotap.agents.losses import gaussian_kl
 from cotap.checks import require_one_of, require_range
 
@@ -24,13 +25,16 @@ class DistillationConfig:
     """Iterations in which the weight falls linearly to zero."""
     agents: tuple[str, ...] = ("lower",)
     """Agents that are guided."""
+    anew: tuple[str, ...] = ()
+    """Agents whose actions begin at zero, all else as the base has it."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
         require_range("distillation.beta", self.beta, 0.0, 1e3)
         require_range("distillation.end_iterations", self.end_iterations, 1, 10**9)
-        for name in self.agents:
-            require_one_of("distillation.agents", name, ("lower", "upper"))
+        for field in ("agents", "anew"):
+            for name in getattr(self, field):
+                require_one_of(f"distillation.{field}", name, ("lower", "upper"))
 
 
 class Guide:
@@ -50,8 +54,10 @@ class Guide:
         self._fingerprint = self.fingerprint()
 
     def start(self, model: DualActorCritic) -> None:
-        """Give `model` the base's weights."""
+        """Give `model` the base's weights, but for the outputs of agents that begin anew."""
         model.load_state_dict(self.model.state_dict())
+        for name in self.cfg.anew:
+            cast(Head | SymmetricHead, model.actors[name]).answer_zero()
 
     def fingerprint(self) -> str:
         """SHA-256 of the frozen policy's bytes, tensor by tensor in the order of their names."""

@@ -31,6 +31,12 @@ class Head(nn.Module):
         with torch.autocast(x.device.type, enabled=False):
             return self.mlp[-1](x.float())
 
+    def answer_zero(self) -> None:
+        """From now on, answer zero to every input; what is learned starts from there."""
+        last = cast(nn.Linear, self.mlp[-1])
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+
 
 class SymmetricHead(nn.Module):
     """An MLP that answers the mirror image of its input with the mirror image of its output, whatever its weights.
@@ -82,6 +88,11 @@ class SymmetricHead(nn.Module):
             image = self._mirror_output(weight)
             bias = 0.5 * (bias + self._mirror_output(bias))
             return functional.linear(x.float(), torch.cat((weight, image), 1), bias)
+
+    def answer_zero(self) -> None:
+        """From now on, answer zero to every input; what is learned starts from there."""
+        nn.init.zeros_(self.output_weight)
+        nn.init.zeros_(self.output_bias)
 
     def _first_layer(self, x: torch.Tensor) -> torch.Tensor:
         even, odd = self.parity.weights(self.weights[0])

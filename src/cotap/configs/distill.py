@@ -39,6 +39,8 @@ def default(base: BaseTraining) -> DistillTraining:
     _after_base(training, base)
     env.forces.pushes.hand_share = 0.5  # hands are what the law is for
     env.rewards.upper.reference_closeness = 1.0
+    if env.actions.upper_mode == "residual":
+        training.distillation.anew = ("upper",)  # under PD it has learned to resist loads
     training.train_for(150e6)
     return training
 
@@ -57,6 +59,7 @@ def paper(base: BaseTraining) -> DistillTraining:
     sampling = LawSampling(enabled=True, stiffness=(150.0, 450.0), log_uniform=False)
     training.env.upper_body = UpperBodyConfig(left=pd_damped, right=copy.deepcopy(pd_damped), sampling=sampling)
     training.env.forces.pushes.enabled = False
+    training.distillation.anew = ()
     training.runner.iterations = 20_000
     return training
 
@@ -103,6 +106,7 @@ def facet(base: BaseTraining) -> DistillTraining:
     move the reference in evaluation alone, by the law `facet`."""
     training = ablation(base)
     training.env.upper_body = UpperBodyConfig()
+    training.distillation.anew = ()
     track_as_facet(training.env.rewards.upper)
     return training
 
@@ -117,6 +121,7 @@ def modulated(base: BaseTraining) -> DistillTraining:
     for name, weight in TASK_WEIGHTS.items():
         setattr(env.rewards.upper, name, weight)
     env.rewards.upper.track_arms = env.rewards.upper.track_key_points = 0.0  # which would not give way
+    training.distillation.anew = ()
     training.ppo.upper_gamma = 0.97  # a hand that gave way takes half a second to return
     training.train_for(60e6)
     return training

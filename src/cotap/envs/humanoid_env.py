@@ -190,7 +190,7 @@ class HumanoidEnv(VecEnv):
         self.record = self.recorder.record(
             self.state, self.commands.current(), self.motions.current(), action, self.observer.last_action,
             (self.state.joint_vel - velocity_before) / self.dt, self.torque, self.actuation.current, fell,
-            self.hand_force_w, self.forces.hand_push_w,
+            self.hand_force_w, self.forces.hand_push_w, self.upper_body.compliant,
         )  # fmt: skip
         self.num_diverged += int(bad.sum())
         rewards, log = self._reward(bad, time_out)

@@ -46,7 +46,7 @@ class Recorder(Stateful):
     def record(
         self, s: RobotState, command: Command, reference: ArmReference, action: torch.Tensor,
         last_action: torch.Tensor, acceleration: torch.Tensor, torque: torch.Tensor, target: torch.Tensor,
-        fell: torch.Tensor, hand_force_w: torch.Tensor, hand_push_w: torch.Tensor,
+        fell: torch.Tensor, hand_force_w: torch.Tensor, hand_push_w: torch.Tensor, compliant_arms: torch.Tensor,
     ) -> StepRecord:  # fmt: skip
         """The record of a step, once. Arguments are as its fields; `target` (N, J) are all joints' [rad]."""
         wanted = self._reader.arm_chains.pose(reference.position.unflatten(1, (self._num_arms, -1)))
@@ -71,6 +71,7 @@ class Recorder(Stateful):
             fell=fell,
             hand_force_w=hand_force_w,
             hand_push_w=hand_push_w,
+            compliant_arms=compliant_arms,
             scales=self._scales,
         )
 

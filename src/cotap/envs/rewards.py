@@ -59,12 +59,20 @@ class StepRecord:
     """(N, H, 3) force on each hand during the step, world frame [N]."""
     hand_push_w: torch.Tensor
     """(N, H, 3) what of that is a push."""
+    compliant_arms: torch.Tensor
+    """(N, H) bool: the arm's law commands a stiffness of the hand."""
     scales: RobotScales
 
     @property
     def free_hands(self) -> torch.Tensor:
         """(N, H) bool: no force acts on the hand."""
         return ~self.hand_force_w.any(2)
+
+    @property
+    def tracking_arms(self) -> torch.Tensor:
+        """(N, H) bool: the arm is asked to be at its reference. One that is compliant and under a force is not: it
+        would be paid for being stiffer than its law."""
+        return self.free_hands | ~self.compliant_arms
 
     @property
     def loaded_hands(self) -> torch.Tensor:
@@ -121,6 +129,12 @@ def _limit_excess(s: StepRecord, joints: slice) -> torch.Tensor:
     """By how much joints exceed their soft limits [rad]."""
     q, low, high = s.state.joint_pos[:, joints], s.scales.joint_low[joints], s.scales.joint_high[joints]
     return ((low - q).clamp_min(0.0) + (q - high).clamp_min(0.0)).sum(1)
+
+
+def _of_tracking_arms(s: StepRecord, error: torch.Tensor) -> torch.Tensor:
+    """Squared error (N,) of key points (N, P, 3), hands then elbows, of arms that are to be at their reference."""
+    arms, squared = s.tracking_arms, error.square().sum(2)
+    return (squared * arms.repeat(1, squared.shape[1] // arms.shape[1])).sum(1)
 
 
 def _lower(s: StepRecord) -> slice:
@@ -293,22 +307,23 @@ class UpperRewards:
 
     @term(3.0)
     def track_arms(s: StepRecord) -> torch.Tensor:
-        """Arm joint angles against the reference."""
+        """Joint angles of arms that are asked to be at their reference, against it."""
         error = s.state.joint_pos[:, _upper(s)] - s.reference.position
-        return torch.exp(-error.square().sum(1) / 0.06)
+        arms = s.tracking_arms
+        return torch.exp(-(error.square().unflatten(1, (arms.shape[1], -1)).sum(2) * arms).sum(1) / 0.06)
 
     @term(1.0)
     def track_key_points(s: StepRecord) -> torch.Tensor:
-        """Hands and elbows against the reference, carried in the torso frame (paper, appendices A and B)."""
-        return torch.exp(-(s.key_points_t - s.key_points_reference_t).square().sum((1, 2)) / 0.01)
+        """The same of their hands and elbows, carried in the torso frame (paper, appendices A and B)."""
+        return torch.exp(-_of_tracking_arms(s, s.key_points_t - s.key_points_reference_t) / 0.01)
 
     @term(0.3)
     def track_key_velocities(s: StepRecord) -> torch.Tensor:
-        """Velocities in the world of hands and elbows against the reference's, carried by the torso (appendix A)."""
+        """The same of their velocities in the world, the reference's carried by the torso (appendix A)."""
         spin = s.state.torso_angular_velocity_t.unsqueeze(1)
         offset = s.key_points_t - s.key_points_reference_t
         error = s.key_velocities_t - s.key_velocities_reference_t + torch.linalg.cross(spin.expand_as(offset), offset)
-        return torch.exp(-error.square().sum((1, 2)))
+        return torch.exp(-_of_tracking_arms(s, error))
 
     @term(0.0)
     def track_hands_as_facet(s: StepRecord) -> torch.Tensor:

@@ -10,7 +10,7 @@ import torch
 
 from cotap.checks import require_interval, require_one_of, require_range
 from cotap.compliance.interface import ArmState, LawParameters, Remembering, TorqueLaw, UpperBodyLaw
-from cotap.compliance.laws import LAWS, LawConfig
+from cotap.compliance.laws import LAWS, WITHOUT_STIFFNESS, LawConfig
 from cotap.compliance.torso import chain_compliance, hand_base_compliance, torso_compliance
 from cotap.envs.hand_sensing import HandSensors
 from cotap.envs.modulation import Modulation, ModulationConfig
@@ -166,6 +166,13 @@ class UpperBody(Stateful):
     def active(self) -> bool:
         """Whether any arm is under a law that plain PD actuators do not implement by themselves."""
         return any(config.name != "pd" for _, config, _ in self._laws.values())
+
+    @property
+    def compliant(self) -> torch.Tensor:
+        """(N, A) bool: the arm is under a law that commands a stiffness of its hand."""
+        none = torch.zeros(self._shape[:2], dtype=torch.bool, device=self.arms.kp.device)
+        masks = [mine for _, config, mine in self._laws.values() if config.name not in WITHOUT_STIFFNESS]
+        return torch.stack([none, *masks]).any(0)
 
     @property
     def stiffness(self) -> torch.Tensor:
