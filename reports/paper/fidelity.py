@@ -52,7 +52,7 @@ def upper_agent(book: Book) -> None:
     for options in ([], ALONE):
         name = f"tracking-{'without' if options else 'with'}"
         result = book.run(name, "cotap", "velocity-tracking", *TRACKING, *options)
-        found.append(missing("cotap") if result is None else number(result["metrics"]["e_upper"]))
+        found.append(NOT_MEASURED if result is None else number(result["metrics"]["e_upper"]))
     book.paragraph(UPPER, own=found[0], raw=found[1])
 
 

@@ -106,7 +106,9 @@ def any_direction(book: Book) -> None:
         found = []
         for _, mode, force in pushes:
             options = ["--mode", mode, "--random-direction", "--force", f"{force:g}", "0", "0", *law]
-            result = book.run(key(mode, name, f"any-{force:g}"), "cotap", "impact", *options)
+            same = mode == "walking" and force == FORCE_N  # as in the table above
+            known = book.results.get(key(mode, name)) if same else None
+            result = known or book.run(key(mode, name, f"any-{force:g}"), "cotap", "impact", *options)
             found.append(missing("cotap") if result is None else fallen(result))
         book.row(label(book.robot, name), *found)
 

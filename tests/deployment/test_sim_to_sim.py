@@ -58,7 +58,7 @@ def test_trials_that_fell_are_in_no_figure_of_the_hand(spec: RobotSpec, part: Ca
 
         if part is loads:
             return loads(run, spec, protocol, Comparison(), UpperBodyConfig())["PD"]
-        return periodic(run, spec, Comparison())
+        return periodic(run, spec, Comparison(), UpperBodyConfig())
 
     one, two, none = result(False), result(False, True), result(True)
     if part is loads:

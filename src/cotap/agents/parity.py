@@ -38,14 +38,18 @@ class Parity(nn.Module):
         ):
             self.register_buffer(name, value, persistent=False)
 
+    @property
+    def _mirror(self) -> Reflection:
+        return Reflection(self.index, self.sign)
+
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """(N, inputs) to (N, inputs): the even part, then the odd one."""
-        image = x.index_select(1, self.index) * self.sign
+        image = self._mirror(x)
         parts = (x + image).index_select(1, self.even), (x - image).index_select(1, self.odd)
         return 0.5 * torch.cat(parts, 1)
 
     def weights(self, weight: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """For weights (U, inputs) of whole inputs, those (U, E) of the even part and (U, O) of the odd one."""
         weight = weight * self.scale
-        image = weight.index_select(1, self.index) * self.sign
+        image = self._mirror(weight)
         return (weight + image).index_select(1, self.even), (weight - image).index_select(1, self.odd)

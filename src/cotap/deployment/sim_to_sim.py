@@ -139,7 +139,7 @@ def _parts(policy: OnnxPolicy, cfg: Comparison, run: Run) -> dict[str, Callable[
         "velocity-tracking": lambda: tracking(run(Scenario(cfg.episode_seconds), cfg.trials), policy, cfg),
         "impact": lambda: loads(run, spec, impact, cfg, trained),
         "constant-load": lambda: loads(run, spec, load, cfg, trained),
-        "periodic-load": lambda: periodic(run, spec, cfg),
+        "periodic-load": lambda: periodic(run, spec, cfg, trained),
         "perturbations": lambda: {
             label: falls(run(Scenario(cfg.episode_seconds), cfg.perturbed_trials, wrong=wrong))
             for label, wrong in PERTURBATIONS.items()
@@ -200,14 +200,15 @@ def loads(run: Run, spec: RobotSpec, protocol: Impact, cfg: Comparison, trained:
 
 
 def periodic(
-    run: Run, spec: RobotSpec, cfg: Comparison, amplitude: float = 30.0, period: float = 4.0
+    run: Run, spec: RobotSpec, cfg: Comparison, trained: UpperBodyConfig, amplitude: float = 30.0, period: float = 4.0
 ) -> dict[str, Any]:
     """30 N up and down on both hands, right arm PD, left arm under compliance: swings at that period, and statics'.
 
     A slow load asks for joint torque `J^T F` whatever the stiffness, and moves the hand by `J K^-1 J^T F`. Of trials
     that stood.
     """
-    laws = UpperBodyConfig(LawConfig("cotap", (500.0, 500.0, 500.0), 25.0, 0.7), LawConfig("pd"))
+    left = replace(trained.left, name="cotap", stiffness=(500.0, 500.0, 500.0), null_stiffness=25.0, alpha=0.7)
+    laws = replace(trained, left=left, right=LawConfig("pd"))
     load = ForceProfile((0.0, 0.0, amplitude), "both", ONSET_S, period_s=period)
     seconds = ONSET_S + 3.0 * period
     trials = run(Scenario(seconds, command=STAND, force=(load,)), cfg.load_trials, laws, APART)

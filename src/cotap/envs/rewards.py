@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Annotated, Any, TypeVar, cast
 
 import torch
@@ -63,12 +64,12 @@ class StepRecord:
     """(N, H) bool: the arm's law commands a stiffness of the hand."""
     scales: RobotScales
 
-    @property
+    @cached_property
     def free_hands(self) -> torch.Tensor:
         """(N, H) bool: no force acts on the hand."""
         return ~self.hand_force_w.any(2)
 
-    @property
+    @cached_property
     def tracking_arms(self) -> torch.Tensor:
         """(N, H) bool: the arm is asked to be at its reference. One that is compliant and under a force is not: it
         would be paid for being stiffer than its law."""
