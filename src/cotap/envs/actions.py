@@ -17,7 +17,8 @@ class ActionConfig:
     """How actions become joint targets."""
 
     lower_scale: float = 0.25
-    """Radians per unit of lower action, added to the default pose."""
+    """Radians per unit of lower action, added to the default pose. A joint whose stiffness reaches its torque limit
+    before a radian has that share of it: exploration shakes no waist harder than a leg."""
     upper_scale: float = 0.1
     """Radians per unit of upper action."""
     upper_mode: str = "residual"
@@ -41,8 +42,9 @@ class JointTargets:
         cfg.check()
         self.default = torch.tensor([j.default_rad for j in spec.joints])
         """(J,) [rad]."""
-        lower, upper = len(spec.lower_joints), len(spec.upper_joints)
-        self.scale = torch.tensor([cfg.lower_scale] * lower + [cfg.upper_scale] * upper)
+        lower, upper = spec.joints[: len(spec.lower_joints)], len(spec.upper_joints)
+        shares = [min(1.0, j.torque_limit_nm / j.kp) for j in lower]
+        self.scale = torch.tensor([cfg.lower_scale * share for share in shares] + [cfg.upper_scale] * upper)
         """(J,) radians per unit of action."""
         self._residual = cfg.upper_mode == "residual"
 

@@ -225,7 +225,7 @@ class LowerRewards:
         """Squared angular velocity of the torso about its horizontal axes."""
         return s.state.torso_angular_velocity_t[:, :2].square().sum(1)
 
-    @term(1.0)
+    @term(5.0)
     def contact_schedule(s: StepRecord) -> torch.Tensor:
         """Share of feet that are on the ground, or off it, as the gait's phase asks."""
         return (s.state.foot_contact == s.desired_contact).float().mean(1)
