@@ -14,7 +14,7 @@ from cotap.evaluation.metrics import (
     steps_since_change,
     summaries,
     summarize,
-    swing_heights,
+    swings,
     tracking_measures,
     tracking_slopes,
     wilson_interval,
@@ -60,6 +60,7 @@ def test_perfect_tracking_has_no_error():
     for of_standing in ("stand_drift", "e_height"):
         assert m[of_standing].isnan().all()
     assert m["swing_height"].isnan().all()
+    assert m["stride_rate"].tolist() == [0.0, 0.0]
 
 
 def test_constant_errors_by_hand():
@@ -245,12 +246,16 @@ def test_swing_height_is_the_mean_of_the_peaks_of_true_swings():
     contact[45:47, 0, 0] = False  # chatter
     height[45:47, 0, 0] = 0.5
     counted = torch.ones(60, 1, dtype=torch.bool)
-    assert swing_heights(height, contact, counted, 5)[0] == pytest.approx(0.08, rel=1e-5)
-    for as_long, mean in ((10, 0.08), (2, (0.1 + 0.06 + 0.5) / 3.0)):
-        assert swing_heights(height, contact, counted, as_long)[0] == pytest.approx(mean, rel=1e-5)
-    assert swing_heights(height, contact, counted, 11).isnan().all()
+    assert swings(height, contact, counted, 5)[0] == pytest.approx(0.08, rel=1e-5)
+    for as_long, mean, number in ((10, 0.08, 2), (2, (0.1 + 0.06 + 0.5) / 3.0, 3)):
+        peak, count = swings(height, contact, counted, as_long)
+        assert float(peak) == pytest.approx(mean, rel=1e-5)
+        assert float(count) == number
+    peak, count = swings(height, contact, counted, 11)
+    assert peak.isnan().all()
+    assert float(count) == 0.0
     counted[25:] = False
-    assert swing_heights(height, contact, counted, 5)[0] == pytest.approx(0.1, rel=1e-5)
+    assert swings(height, contact, counted, 5)[0] == pytest.approx(0.1, rel=1e-5)
 
 
 def test_swings_count_once_a_command_to_walk_has_settled():
@@ -261,9 +266,12 @@ def test_swings_count_once_a_command_to_walk_has_settled():
     for begin, peak in ((20, 0.3), (120, 0.2), (170, 0.07)):
         t.foot_contact[begin : begin + 10, :, 0] = False
         t.foot_height[begin : begin + 10, :, 0] = peak
-    height = tracking_measures(t, 0.8)["swing_height"]
+    measures = tracking_measures(t, 0.8)
+    height, rate = measures["swing_height"], measures["stride_rate"]
     assert float(height[0]) == pytest.approx(0.07)
     assert height[1].isnan()
+    assert float(rate[0]) == pytest.approx(0.25)  # one swing of one foot of two in the 2 s that count
+    assert rate[1].isnan()
 
 
 def test_a_command_has_settled_after_a_second_unless_told_otherwise():

@@ -171,7 +171,7 @@ def falls(trials: list[Trial]) -> dict[str, Any]:
 def tracking(trials: list[Trial], policy: OnnxPolicy, cfg: Comparison) -> dict[str, Any]:
     """Falls and tracking errors."""
     measures = tracking_measures(_trajectory(trials, cfg.episode_seconds), gait_config(policy.metadata).period_s)
-    names = ("e_lin", "e_lin_gait", "e_yaw_gait", "e_height", "e_upper", "stand_drift", "swing_height")
+    names = ("e_lin", "e_lin_gait", "e_yaw_gait", "e_height", "e_upper", "stand_drift", "swing_height", "stride_rate")
     return falls(trials) | {"metrics": {name: summarize(measures[name], cfg.seed) for name in names}}
 
 

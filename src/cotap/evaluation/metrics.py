@@ -60,10 +60,14 @@ def slope(commanded: torch.Tensor, measured: torch.Tensor, mask: torch.Tensor) -
     return float((x * (y - y.mean())).sum() / x.square().sum())
 
 
-def swing_heights(foot_height: torch.Tensor, contact: torch.Tensor, mask: torch.Tensor, min_steps: int) -> torch.Tensor:
-    """Mean peak height (N,) of the feet over swings of at least `min_steps` that end inside `mask` (T, N) [m].
+def swings(
+    foot_height: torch.Tensor, contact: torch.Tensor, mask: torch.Tensor, min_steps: int
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Mean peak height (N,) of the feet over swings of at least `min_steps` that end inside `mask` (T, N) [m], and the
+    number of these swings (N,).
 
-    A swing is a stretch without contact; shorter stretches than `min_steps` are chatter. NaN for an env with none.
+    A swing is a stretch without contact; shorter stretches than `min_steps` are chatter. The height is NaN for an env
+    with none.
     """
     peak = torch.zeros(foot_height.shape[1:])
     length = torch.zeros(foot_height.shape[1:])
@@ -74,7 +78,8 @@ def swing_heights(foot_height: torch.Tensor, contact: torch.Tensor, mask: torch.
         count += landed.float()
         peak = torch.where(touching, torch.zeros_like(peak), torch.maximum(peak, height))
         length = torch.where(touching, torch.zeros_like(length), length + 1)
-    return torch.where(count.sum(1) > 0, total.sum(1) / count.sum(1).clamp_min(1), torch.full((len(total),), math.nan))
+    number = count.sum(1)
+    return torch.where(number > 0, total.sum(1) / number.clamp_min(1), torch.full_like(number, math.nan)), number
 
 
 def tracking_measures(t: Trajectory, gait_period_s: float, settle_s: float = 1.0) -> dict[str, torch.Tensor]:
@@ -84,12 +89,15 @@ def tracking_measures(t: Trajectory, gait_period_s: float, settle_s: float = 1.0
     stand, which alone are asked for other heights than the nominal, once theirs has held for `HEIGHT_SETTLE_S`. `_gait`
     errors use velocities averaged over a gait period, all of it settled, and so do `stand_drift`, the speed while asked
     to stand, and `still_share`, the share of that time that is slower than `STILL_SPEED` with all feet down.
+    `stride_rate` is how often each foot swings while asked to walk; the gait asks for one swing a period.
     """
     period = round(gait_period_s / t.dt)
     ok = settled(t, settle_s)
     ok_gait = settled(t, settle_s + gait_period_s)
     error = t.velocity - t.command
-    walking = ~t.stand
+    walking = ok & ~t.stand
+    swing_height, num_swings = swings(t.foot_height, t.foot_contact, walking, round(0.1 / t.dt))
+    walking_s = walking.sum(0) * t.dt
     contact = t.foot_contact & ok.unsqueeze(2)
     slip = torch.where(contact, t.foot_speed, torch.zeros_like(t.foot_speed)).sum((0, 2)) / contact.sum(
         (0, 2)
@@ -112,7 +120,8 @@ def tracking_measures(t: Trajectory, gait_period_s: float, settle_s: float = 1.0
         "stand_drift": masked_mean(drift, ok_stand),
         "still_share": masked_mean(still.float(), ok_stand),
         "foot_slip": torch.where(contact.any(2).any(0), slip, torch.full_like(slip, math.nan)),
-        "swing_height": swing_heights(t.foot_height, t.foot_contact, ok & walking, round(0.1 / t.dt)),
+        "swing_height": swing_height,
+        "stride_rate": num_swings / t.foot_contact.shape[2] / torch.where(walking_s > 0.0, walking_s, math.nan),
         "e_path": masked_mean(t.path_error, t.alive() & torch.isfinite(t.path_error)),
         "fall_fraction": t.fell.any(0),
         "episode_length_fraction": t.alive().float().mean(0),

@@ -13,7 +13,8 @@ from cotap.files import require_output, write_atomically
 
 UNITS = {
     "e_lin": "m/s", "e_lin_gait": "m/s", "e_yaw": "rad/s", "e_yaw_gait": "rad/s", "e_height": "m", "e_upper": "rad",
-    "e_ee": "m", "j_upper": "Nm", "stand_drift": "m/s", "foot_slip": "m/s", "swing_height": "m", "e_path": "m",
+    "e_ee": "m", "j_upper": "Nm", "stand_drift": "m/s", "foot_slip": "m/s", "swing_height": "m",
+    "stride_rate": "1/s", "e_path": "m",
     "e_torso": "m/s", "e_torso_x": "m/s", "e_torso_y": "m/s", "e_ee_hit": "m", "peak_torque": "Nm",
     "energy": "J", "recovery_s": "s", "settle_s": "s", "transient_energy": "J/kg", "oscillation_energy": "J/kg",
     "displacement_x": "m", "displacement_y": "m", "displacement_z": "m",
