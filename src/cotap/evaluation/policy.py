@@ -17,7 +17,7 @@ from cotap.configs import from_plain, to_plain
 from cotap.envs import HumanoidEnvConfig
 from cotap.envs.config import RewardConfig
 
-CHECKPOINTS = ("h1-base", "h1-cotap")
+CHECKPOINTS = ("h1-base", "h1-cotap", "g1-base", "g1-cotap")
 """Names under which policies are shipped: robot and stage."""
 
 
