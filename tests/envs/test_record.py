@@ -8,7 +8,7 @@ import pytest
 import torch
 from env_tools import NOMINAL, drive, hold_still, knock_over, mujoco_of, zeros
 
-from cotap.envs.record import height_slope
+from cotap.envs.record import height_slope, in_phase
 from cotap.envs.rewards import UpperRewards
 
 EPS = 1e-4
@@ -195,3 +195,9 @@ def test_the_height_slope_is_numpys_regression_over_standing_robots():
     slope = height_slope(*(torch.tensor(values) for values in (measured, commanded, stand.astype(float))))
     assert float(slope) == pytest.approx(np.polyfit(commanded[stand], measured[stand], 1)[0], rel=1e-6)
     assert float(height_slope(torch.ones(3), torch.ones(3), torch.zeros(3))) == 0.0  # nobody stands
+
+
+def test_in_phase_is_the_share_of_feet_of_walking_robots():
+    as_asked = torch.tensor([[True, False], [False, False], [True, True]])
+    assert float(in_phase(as_asked, torch.tensor([0.0, 0.0, 1.0]))) == 0.25  # one foot of four
+    assert float(in_phase(as_asked, torch.ones(3))) == 0.0  # nobody walks

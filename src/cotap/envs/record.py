@@ -115,9 +115,16 @@ def step_log(r: StepRecord, time_out: torch.Tensor, ok: torch.Tensor | slice, dt
         "/command/slope_y": slope[1],
         "/command/slope_yaw": slope[2],
         "/command/slope_height": height_slope(s.height[ok], c.height[ok], c.stand[ok]),
+        "/command/in_phase": in_phase((s.foot_contact == r.desired_contact)[ok], c.stand[ok]),
         "/episode/falls_per_s": r.fell.float().mean() / dt,
         "/episode/time_outs_per_s": time_out.float().mean() / dt,
     }
+
+
+def in_phase(as_asked: torch.Tensor, stand: torch.Tensor) -> torch.Tensor:
+    """Share of the feet (N, F) of walking robots that rest or swing as the gait asks."""
+    walking = 1.0 - stand
+    return (walking * as_asked.float().mean(1)).sum() / walking.sum().clamp_min(1.0)
 
 
 def height_slope(measured: torch.Tensor, commanded: torch.Tensor, stand: torch.Tensor) -> torch.Tensor:
