@@ -201,3 +201,17 @@ def test_in_phase_is_the_share_of_feet_of_walking_robots():
     as_asked = torch.tensor([[True, False], [False, False], [True, True]])
     assert float(in_phase(as_asked, torch.tensor([0.0, 0.0, 1.0]))) == 0.25  # one foot of four
     assert float(in_phase(as_asked, torch.ones(3))) == 0.0  # nobody walks
+
+
+def test_the_log_has_the_share_of_feet_in_phase(make_env, robot):
+    env = make_env(16, robot=robot)
+    for _ in range(10):
+        *_, extras = env.step(zeros(env))
+        r = env.record
+        feet = [
+            float((force > 5.0) == down)
+            for forces, wanted, stand in zip(r.state.foot_force, r.desired_contact, r.command.stand, strict=True)
+            for force, down in zip(forces, wanted, strict=True)
+            if stand == 0
+        ]
+        assert float(extras["log"]["/command/in_phase"]) == pytest.approx(np.mean(feet), abs=1e-6)
