@@ -7,7 +7,6 @@ import cotap.uncompiled  # noqa: F401 - before what would load the compiler
 # isort: split
 
 import inspect
-import json
 import sys
 import time
 from dataclasses import dataclass
@@ -145,9 +144,9 @@ def prepare(options: Options[Protocol]) -> tuple[HumanoidEnv, Policy, str]:
     """The environment that the protocol makes of the policy's own, ready to run, the policy, and its file's digest."""
     import torch
 
-    from cotap.agents.checkpoint import require_layout, sha256
+    from cotap.agents.checkpoint import sha256
     from cotap.envs import HumanoidEnv
-    from cotap.evaluation.policy import load_policy
+    from cotap.evaluation.policy import load_policy, require_acting
     from cotap.sim import resolve_backend
 
     protocol = options.protocol
@@ -167,7 +166,7 @@ def prepare(options: Options[Protocol]) -> tuple[HumanoidEnv, Policy, str]:
     if protocol.drives or cfg.fixed_base:  # another sets the laws, or there is no policy that could
         cfg.upper_body.modulation.hold()
     env = HumanoidEnv(cfg)
-    require_layout(path, policy.layout, json.loads(json.dumps(env.layout())))
+    require_acting(path, policy, env.layout())
     protocol.prepare(env)
     return env, policy.to(env.device), sha256(path)
 

@@ -78,7 +78,7 @@ TERMS = [
 ]  # fmt: skip
 """Appendix B: what actors see of one step, widths on H1, scales."""
 CRITIC_TERMS = [
-    ("torso_orientation", 4, 1.0), ("torso_linear_velocity", 3, 2.0), ("hand_force_0", 3, 0.1), ("hand_force_1", 3, 0.1)
+    ("torso_orientation", 4, 1.0), ("torso_linear_velocity", 3, 2.0), ("hand_force", 6, 0.1)
 ]  # fmt: skip
 """What critics see beside that."""
 UNITREE_KP = {

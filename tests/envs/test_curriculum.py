@@ -9,11 +9,13 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from env_tools import NOMINAL, drive, felt, hold_still, mujoco_of, zeros
+from env_tools import NOMINAL, drive, felt, hold_still, knock_over, mujoco_of, zeros
 
 from cotap.compliance.kinematics import ChainPose
 from cotap.envs.commands import Command
-from cotap.envs.curriculum import AssistConfig, AssistWrench, RampConfig
+from cotap.envs.curriculum import AssistConfig, AssistWrench, Curriculum, CurriculumConfig, RampConfig
+from cotap.envs.external_forces import ExternalForceConfig
+from cotap.envs.pushes import PushConfig
 from cotap.envs.state import RobotState
 from cotap.robots.mjcf import torso_inertia
 
@@ -59,10 +61,58 @@ def test_commands_are_slow_while_robots_are_assisted(make_env, robot):
     envs = [make_env(512, robot=robot, assist=AssistConfig(enabled, first_velocities=0.3)) for enabled in (True, False)]
     slow, fast = (env.commands.asked_velocity.abs().amax(0) for env in envs)
     torch.testing.assert_close(slow, 0.3 * fast)
-    envs[0].samples = 10**9
+    envs[0].curriculum.samples = 10**9
     envs[0].commands._remaining_s.zero_()
     envs[0].step(zeros(envs[0]))
     assert (envs[0].commands.asked_velocity.abs().amax(0) > 2.0 * slow).all()
+
+
+def test_a_curriculum_counts_samples_while_few_fall():
+    """By hand, at steps of 1 s: the average over 10 s of falls moves by a tenth of the way."""
+    curriculum = Curriculum(CurriculumConfig(max_falls_per_s=0.02), dt=1.0)
+    nobody, one = torch.zeros(4, dtype=torch.bool), torch.tensor([False, True, False, False])
+    curriculum.step(nobody, 100)
+    assert curriculum.state_dict() == {"samples": 100, "falls_per_s": 0.0}
+    curriculum.step(one, 100)  # a quarter fell: 0.1 * 0.25 = 0.025
+    assert curriculum.falls_per_s == pytest.approx(0.025)
+    assert curriculum.samples == 100
+    for average, samples in ((0.0225, 100), (0.02025, 100), (0.018225, 200), (0.0164025, 300)):
+        curriculum.step(nobody, 100)
+        assert curriculum.falls_per_s == pytest.approx(average)
+        assert curriculum.samples == samples
+    other = Curriculum(CurriculumConfig(), dt=1.0)
+    other.load_state_dict(curriculum.state_dict())
+    assert other.state_dict() == curriculum.state_dict()
+
+
+def test_nothing_changes_while_many_fall(make_env, robot):
+    """Assistance stays and pushes do not grow, whatever the samples."""
+    pushes = PushConfig(enabled=True, ramp=RampConfig(0.0, 100.0))
+    env = make_env(
+        4, robot=robot, assist=AssistConfig(True, full_samples=0, end_samples=100),
+        curriculum=CurriculumConfig(max_falls_per_s=0.0), forces=ExternalForceConfig(pushes=pushes),
+    )  # fmt: skip
+    knock_over(env, 0)
+    _, _, done, extras = env.step(zeros(env))
+    assert done.tolist() == [True, False, False, False]
+    for _ in range(30):
+        _, _, _, extras = env.step(zeros(env))
+    assert (env.samples, env.curriculum.samples, env.forces.pushes._share) == (4 * 31, 0, 0.0)
+    assert extras["log"]["/curriculum/assist"].item() == 1.0
+    assert extras["log"]["/curriculum/samples"].item() == 0.0
+
+
+def test_a_curriculum_goes_on_with_its_envs(make_env, robot):
+    env, other = (make_env(2, robot=robot) for _ in range(2))
+    drive(env, 3)
+    env.curriculum.falls_per_s = 0.5
+    other.load_state_dict(env.state_dict())
+    assert other.curriculum.state_dict() == {"samples": 6, "falls_per_s": 0.5}
+
+
+def test_a_bad_limit_of_falls_is_named():
+    with pytest.raises(ValueError, match=r"curriculum\.max_falls_per_s"):
+        CurriculumConfig(-0.1).check()
 
 
 def test_assistance_may_end_all_at_once():

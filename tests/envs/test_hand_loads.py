@@ -123,6 +123,29 @@ def test_loads_of_some_episodes_only(rng):
     assert not torch.equal(again[:2000], loaded[:2000])
 
 
+def test_critics_see_the_load_that_comes(rng):
+    hands = loads(40, hold_s=(0.2, 0.2), zero_probability=0.0, ramp=RampConfig(0.0, 100.0))
+    hands.reset(everyone(40), rng)
+    for _ in range(4):
+        hands.step(rng)
+    seen, now = hands.ahead(50.0), of(hands, 50.0)
+    near = np.exp(-0.12)
+    assert seen[:, 0].tolist() == pytest.approx([near] * 40, rel=1e-4)
+    for _ in range(7):
+        hands.step(rng)
+    then = of(hands, 50.0)
+    assert not torch.equal(now, then)
+    torch.testing.assert_close(seen[:, 1:] / near, then.flatten(1), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("cfg", [{"enabled": False}, {"episode_share": 0.0}])
+def test_where_no_load_comes_critics_see_none(rng, cfg):
+    hands = loads(4, **cfg)
+    hands.reset(everyone(4), rng)
+    hands.step(rng)
+    assert not hands.ahead(0.0).any()
+
+
 def test_reset_touches_only_its_envs(rng):
     hands = loads(2, zero_probability=0.0)
     hands.reset(everyone(2), rng)

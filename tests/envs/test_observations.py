@@ -30,7 +30,7 @@ def test_terms_are_the_papers():
     assert sum(width for _, width, _ in terms) == 86
     assert sum(width for _, width, _ in critic_terms(2)) == 13
     assert 5 * 86 + 13 == 443
-    assert [s for _, _, s in critic_terms(2)] == [1.0, 2.0, 0.1, 0.1]
+    assert [s for _, _, s in critic_terms(2)] == [1.0, 2.0, 0.1]
 
 
 def test_terms_have_the_robots_sizes(any_spec):

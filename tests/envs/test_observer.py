@@ -12,7 +12,7 @@ from env_tools import NOISY, drive, history_of, mujoco_of, newest, one_step, pri
 
 from cotap.envs.external_forces import ExternalForceConfig
 from cotap.envs.hand_loads import HandLoadConfig
-from cotap.envs.observations import NoiseConfig, ObservationConfig
+from cotap.envs.observations import NoiseConfig, ObservationConfig, critic_terms
 
 LOADED = ExternalForceConfig(hand_loads=HandLoadConfig(enabled=True, episode_share=1.0, zero_probability=0.0))
 
@@ -64,8 +64,9 @@ def test_what_only_critics_see_is_what_it_names(make_env, robot):
     obs, _, done, _ = env.step(zeros(env))
     assert not done.any()
     got = privileged(env, obs["privileged"])
-    hands = [f"hand_force_{i}" for i in range(len(env.spec.arms))]
-    assert list(got) == ["torso_orientation", "torso_linear_velocity", *hands]
+    names = [name for name, _, _ in critic_terms(2, num_feet=2)]
+    assert list(got) == names
+    assert names[:3] == ["torso_orientation", "torso_linear_velocity", "hand_force"]
     for i in range(4):
         model, data = mujoco_of(env, i)
         torso = torso_of(model, data, env.spec.torso_body)
@@ -73,9 +74,16 @@ def test_what_only_critics_see_is_what_it_names(make_env, robot):
         mujoco.mju_mat2Quat(quat, torso["rotation"].flatten())
         assert abs(float(got["torso_orientation"][i].double() @ torch.tensor(quat))) == pytest.approx(1.0, abs=1e-5)
         np.testing.assert_allclose(got["torso_linear_velocity"][i], torso["velocity"], atol=1e-4)
-    for i, name in enumerate(hands):
-        torch.testing.assert_close(got[name], env.hand_force_w[:, i])
-        assert got[name].norm(dim=1).min() > 1.0
+        height = data.body(env.spec.torso_body).xpos[2]
+        assert float(got["torso_height"][i]) == pytest.approx(height, abs=1e-5)
+    torch.testing.assert_close(got["hand_force"], env.hand_force_w.flatten(1))
+    assert env.hand_force_w.norm(dim=2).min() > 1.0
+    torch.testing.assert_close(got["mean_error"], env.record.mean_error)
+    assert torch.equal(got["foot_contact"], env.state.foot_contact.float())
+    torch.testing.assert_close(got["foot_height"], env.state.foot_pos_w[:, :, 2])
+    ahead = [got[name] for name in names[names.index("push_nearness") :]]
+    torch.testing.assert_close(torch.cat(ahead, 1), env.forces.ahead(env.state.heading_w, env.curriculum.samples))
+    assert got["coming_load"].abs().amax(1).min() > 0.0
 
 
 def test_scales_are_the_papers(make_env):

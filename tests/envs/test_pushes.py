@@ -112,6 +112,46 @@ def test_the_impulse_grows_with_the_samples(rng, samples, share):
     torch.testing.assert_close(impulse, torch.full((200,), share * MASS), rtol=1e-4, atol=1e-4)
 
 
+def test_critics_see_what_comes_before_it_comes(rng):
+    """What is foretold is what then acts, in the heading frame: here a quarter turn to the left of the world's."""
+    p = pushes(300, velocity=(0.4, 0.9), duration_s=(0.04, 0.04), ramp=RampConfig(0.0, 100.0))
+    p.reset(everyone(300), rng)
+    turned = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]).expand(300, 3, 3)
+    for _ in range(10):  # of 15 until the push
+        p.step(50.0, rng)
+    before, total = p.ahead(turned), torch.zeros(300, 3)
+    near = math.exp(-0.1)
+    torch.testing.assert_close(before[:, 0], torch.full((300,), near), rtol=1e-4, atol=0.0)
+    for _ in range(9):
+        p.step(50.0, rng)
+        total += DT * p.current() / MASS
+    foretold = before[:, 1:4] / near
+    torch.testing.assert_close(foretold, torch.stack((total[:, 1], -total[:, 0], total[:, 2]), 1), rtol=1e-3, atol=1e-5)
+    kind = before[:, 4:] / near
+    assert torch.equal(kind.argmax(1), p.place.clamp_max(1 + HANDS))
+    torch.testing.assert_close(kind.sum(1), torch.ones(300), rtol=1e-4, atol=0.0)
+
+
+def test_critics_see_what_is_left_of_a_push(rng):
+    p = pushes(1, velocity=(0.5, 0.5), duration_s=(0.1, 0.1), hand_share=0.0, link_share=0.0)
+    upright = torch.eye(3).unsqueeze(0)
+    run(p, rng, 15)
+    sizes = []
+    for _ in range(8):
+        seen = p.ahead(upright)[0]
+        sizes.append((round(seen[0].item(), 3), round(seen[1:4].norm().item(), 3)))
+        p.step(1e9, rng)
+    on = [size for near, size in sizes if near == 1.0]
+    assert on[-4:] == pytest.approx([0.4, 0.3, 0.2, 0.1], abs=2e-3)
+    assert sizes[-1][0] == pytest.approx(math.exp(-0.18), abs=0.02)  # the next comes 0.3 s after this one
+
+
+def test_where_no_push_comes_critics_see_none(rng):
+    p = pushes(5, episode_share=0.0)
+    run(p, rng, 3)
+    assert not p.ahead(torch.eye(3).expand(5, 3, 3)).any()
+
+
 def test_pushes_of_some_episodes_only(rng):
     p = pushes(4000, episode_share=0.3, velocity=(1.0, 1.0))
     pushed = run(p, rng, 60)[0].norm(dim=2).amax(0) > 0.0

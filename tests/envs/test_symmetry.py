@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
-from env_tools import NOISY, NOMINAL, zeros
+from env_tools import NOISY, NOMINAL, privileged, zeros
 
 from cotap.compliance.laws import LawConfig
 from cotap.envs.config import RewardConfig
 from cotap.envs.external_forces import ExternalForceConfig
+from cotap.envs.hand_loads import HandLoadConfig
 from cotap.envs.modulation import ModulationConfig
 from cotap.envs.observations import ObservationConfig
+from cotap.envs.pushes import PushConfig
 from cotap.envs.rewards import LowerRewards
 from cotap.envs.scripted_forces import ForceProfile
 from cotap.envs.symmetry import joint_reflection
@@ -166,11 +170,43 @@ def test_the_phase_is_mirrored_by_half_a_stride(make_env):
     torch.testing.assert_close(image[0, columns], obs["policy"][1, columns], atol=1e-5, rtol=0)
 
 
+def test_what_is_to_come_is_mirrored(make_env, robot):
+    """A push on the left hand from the left, and loads to come, by hand."""
+    forces = ExternalForceConfig(
+        HandLoadConfig(enabled=True, episode_share=1.0), PushConfig(enabled=True, episode_share=1.0)
+    )
+    env = make_env(1, robot=robot, forces=forces)
+    pushes, loads = env.forces.pushes, env.forces.hand_loads
+    pushes._share, pushes._next_s[:], loads._remaining_s[:] = 1.0, 0.5, 1.0
+    pushes._coming_place[:], pushes._coming_w[0] = 1, env.state.heading_w[0] @ torch.tensor([0.1, -0.6, 0.2])
+    loads._coming_h[0] = torch.tensor([[1.0, 2.0, 3.0], [-4.0, 5.0, -6.0]])
+    seen = env.observer.observe(
+        **env._observed(), restarted=torch.zeros(1, dtype=torch.bool), rng=env.rng
+    )["privileged"]  # fmt: skip
+    own, image = (privileged(env, v) for v in (seen, env.symmetry.observations["privileged"](seen)))
+    near, far = math.exp(-0.5), math.exp(-1.0)
+    for got, sideways, place, coming in (
+        (own, -0.6, [0, 1, 0, 0], [1, 2, 3, -4, 5, -6]),
+        (image, 0.6, [0, 0, 1, 0], [-4, -5, -6, 1, -2, 3]),
+    ):
+        assert got["push_nearness"].item() == pytest.approx(near)
+        assert got["push_velocity"][0].tolist() == pytest.approx([0.1 * near, sideways * near, 0.2 * near], abs=1e-6)
+        assert got["push_place"][0].tolist() == pytest.approx([near * p for p in place])
+        assert got["load_nearness"].item() == pytest.approx(far)
+        assert got["coming_load"][0].tolist() == pytest.approx([far * f for f in coming], abs=1e-5)
+    for name in ("foot_height", "foot_contact"):
+        assert torch.equal(image[name], own[name].flip(1))
+    torch.testing.assert_close(image["mean_error"], own["mean_error"] * torch.tensor([1.0, -1.0, -1.0]))
+
+
 def test_hand_forces_change_arms(make_env, robot):
     env = make_env(1, robot=robot, forces=ExternalForceConfig(scripted=ForceProfile((4.0, 3.0, -8.0), "left", 0.0)))
     obs, *_ = env.step(zeros(env))
-    forces = obs["privileged"][0, -3 * len(env.spec.arms) :].unflatten(0, (-1, 3))
-    image = env.symmetry.observations["privileged"](obs["privileged"])[0, -forces.numel() :].unflatten(0, (-1, 3))
+    reflect = env.symmetry.observations["privileged"]
+    forces, image = (
+        privileged(env, seen)["hand_force"][0].unflatten(0, (-1, 3))
+        for seen in (obs["privileged"], reflect(obs["privileged"]))
+    )
     assert torch.equal(image, forces.flip(0) * torch.tensor([1.0, -1.0, 1.0]))
     assert forces[0].any()
     assert not forces[1].any()

@@ -25,12 +25,13 @@ VERSION = 1
 PARTS: dict[str, Any] = {
     "kind": str, "layout": dict, "agents": dict, "config": dict, "model": dict, "learner": dict, "env": dict,
     "iteration": int, "samples": int, "wall_seconds": (int, float), "rng": torch.Tensor, "device_rng": torch.Tensor,
+    "curriculum": dict,
 }  # fmt: skip
 """What a checkpoint of a run holds; the parts of a shipped one may be empty."""
 STAGES = ("base", "distill")
 """Of training; what the part `kind` may be."""
-OPTIONAL_PARTS = {"device_rng"}
-"""What some checkpoints lack: random numbers of a GPU, if networks were on none."""
+OPTIONAL_PARTS = {"device_rng", "curriculum"}
+"""What some checkpoints lack: random numbers of a GPU, if networks were on none; an environment's curriculum."""
 MALFORMED = (RuntimeError, ValueError, TypeError, LookupError, AttributeError, OverflowError)
 """What code that takes over a state raises where the state is not what it should be."""
 

@@ -302,6 +302,8 @@ class DualRunner(OnPolicyRunner):
                 env.load_state_dict(mine["env"])
             else:
                 env.samples = content["samples"]
+                if "curriculum" in content:
+                    env.curriculum.load_state_dict(content["curriculum"])
                 say(f"{path}: no simulator states for this run; starting those afresh")
         except MALFORMED as error:
             raise CheckpointError(
@@ -356,6 +358,7 @@ class DualRunner(OnPolicyRunner):
             "model": self.alg.model.state_dict(),
             "learner": self.alg.state_dict(),
             **self._own_state(envs),
+            **({"curriculum": env.curriculum.state_dict()} if hasattr(env, "curriculum") else {}),
             "iteration": self.current_learning_iteration,
             "samples": env.samples,
             "wall_seconds": self.wall_seconds,

@@ -10,7 +10,7 @@ import tyro
 from cotap.checks import require_one_of, require_positive_int, require_range, require_seed
 from cotap.envs.actions import ActionConfig
 from cotap.envs.commands import CommandConfig
-from cotap.envs.curriculum import AssistConfig
+from cotap.envs.curriculum import AssistConfig, CurriculumConfig
 from cotap.envs.external_forces import ExternalForceConfig
 from cotap.envs.gait_phase import GaitConfig
 from cotap.envs.observations import ObservationConfig
@@ -73,6 +73,7 @@ class HumanoidEnvConfig:
     randomization: RandomizationConfig = field(default_factory=RandomizationConfig)
     forces: ExternalForceConfig = field(default_factory=ExternalForceConfig)
     assist: AssistConfig = field(default_factory=AssistConfig)
+    curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
@@ -87,7 +88,7 @@ class HumanoidEnvConfig:
         require_range("unevenness_m", self.unevenness_m, 0.0, 0.2)
         for part in (
             self.actions, self.upper_body, self.observations, self.commands, self.gait, self.motions, self.path,
-            self.terminations, self.forces, self.assist,
+            self.terminations, self.forces, self.assist, self.curriculum,
         ):  # fmt: skip
             part.check()
         self.randomization.check(self.control_dt)

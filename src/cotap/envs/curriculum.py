@@ -40,6 +40,45 @@ class RampConfig:
 
 
 @dataclass
+class CurriculumConfig:
+    """When what changes with the samples goes on, and when it waits."""
+
+    max_falls_per_s: float = 0.02
+    """Falls per second and env above which no disturbance grows and no assistance fades."""
+
+    def check(self) -> None:
+        """Raise ValueError naming the first field that is out of its range."""
+        require_range("curriculum.max_falls_per_s", self.max_falls_per_s, 0.0, 1e3)
+
+
+class Curriculum:
+    """How far training has come: the samples, but for those that were taken while robots fell too often."""
+
+    def __init__(self, cfg: CurriculumConfig, dt: float) -> None:
+        self._cfg, self._dt = cfg, dt
+        self._share = min(dt / _FALLS_OVER_S, 1.0)
+        self.samples, self.falls_per_s = 0, 0.0
+
+    def step(self, fell: torch.Tensor, samples: int) -> None:
+        """Count the `samples` of a step in which the envs of `fell` (N,) have fallen."""
+        self.falls_per_s += self._share * (float(fell.float().mean()) / self._dt - self.falls_per_s)
+        if self.falls_per_s <= self._cfg.max_falls_per_s:
+            self.samples += samples
+
+    def state_dict(self) -> dict[str, float]:
+        """What goes on from step to step."""
+        return {"samples": self.samples, "falls_per_s": self.falls_per_s}
+
+    def load_state_dict(self, state: dict[str, float]) -> None:
+        """Take over what `state_dict` returned. Raises KeyError or TypeError for something else."""
+        self.samples, self.falls_per_s = int(state["samples"]), float(state["falls_per_s"])
+
+
+_FALLS_OVER_S = 10.0
+"""Time over which falls are averaged."""
+
+
+@dataclass
 class AssistConfig:
     """A wrench on the torso that carries the robot through its first, slow steps and fades, ever more slowly.
 

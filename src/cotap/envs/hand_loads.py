@@ -49,12 +49,12 @@ class HandLoadConfig:
 class HandLoads(Stateful):
     """Piecewise constant forces at each hand."""
 
-    STATE = ("_force_h", "_remaining_s", "_loaded")
+    STATE = ("_force_h", "_coming_h", "_remaining_s", "_loaded")
 
     def __init__(self, cfg: HandLoadConfig, num_hands: int, num_envs: int, dt: float) -> None:
         cfg.check()
         self.cfg, self._dt = cfg, dt
-        self._force_h = torch.zeros(num_envs, num_hands, 3)
+        self._force_h, self._coming_h = torch.zeros(2, num_envs, num_hands, 3)
         self._remaining_s = torch.zeros(num_envs)
         self._loaded = torch.ones(num_envs, dtype=torch.bool)
 
@@ -62,7 +62,8 @@ class HandLoads(Stateful):
         """An episode begins in the envs of `mask`."""
         if self.cfg.enabled:
             self._loaded[mask] = torch.rand(int(mask.sum()), generator=rng, device=rng.device) < self.cfg.episode_share
-            self._draw(mask, rng)
+            self._draw(mask, rng)  # the first,
+            self._draw(mask, rng)  # and the one after it
 
     def step(self, rng: torch.Generator) -> None:
         """Advance by one control step; forces that have been held long enough change."""
@@ -71,12 +72,13 @@ class HandLoads(Stateful):
             self._draw(self._remaining_s <= 0.0, rng)
 
     def _draw(self, mask: torch.Tensor, rng: torch.Generator) -> None:
+        """Take up the forces that were drawn last, and draw those after them, so that critics can see what comes."""
         n, cfg, hands = int(mask.sum()), self.cfg, self._force_h.shape[1]
         if n == 0:
             return
         force = torch.stack([uniform(rng, *b, n, hands) for b in (cfg.force_x, cfg.force_y, cfg.force_z)], -1)
         force *= torch.rand(n, hands, 3, generator=rng, device=rng.device) >= cfg.zero_probability
-        self._force_h[mask] = force
+        self._force_h[mask], self._coming_h[mask] = self._coming_h[mask], force
         self._remaining_s[mask] = uniform(rng, *cfg.hold_s, n)
 
     def current(self, jacobian_h: torch.Tensor, torque_limit: torch.Tensor, samples: float) -> torch.Tensor:
@@ -93,3 +95,10 @@ class HandLoads(Stateful):
         limit = (self.cfg.torque_share * torque_limit).masked_fill(weak, torch.inf)
         holdable = (limit / torque.clamp_min(1e-6)).amin(-1).clamp_max(1.0)
         return force * holdable.unsqueeze(-1)
+
+    def ahead(self, samples: float) -> torch.Tensor:
+        """What critics see of the coming change: how near it is (1 as it comes, 1/e a second before; 0 where there are
+        no loads), and by as much the forces then, as drawn, in the heading frame [N]; (N, 1 + 3 hands)."""
+        near = (self._loaded * (-self._remaining_s).exp()).unsqueeze(1)
+        coming = self.cfg.ramp.share(samples) * self._coming_h.flatten(1)
+        return float(self.cfg.enabled) * near * torch.cat((torch.ones_like(near), coming), 1)

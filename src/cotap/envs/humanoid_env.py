@@ -16,7 +16,7 @@ from cotap.envs.actions import JointTargets
 from cotap.envs.actuation import Actuation
 from cotap.envs.commands import CommandSource
 from cotap.envs.config import HumanoidEnvConfig
-from cotap.envs.curriculum import AssistWrench
+from cotap.envs.curriculum import AssistWrench, Curriculum
 from cotap.envs.external_forces import ExternalForces
 from cotap.envs.observer import Observer
 from cotap.envs.path_following import PathFollower
@@ -106,6 +106,7 @@ class HumanoidEnv(VecEnv):
         self._groups = tuple(RewardGroup(g, getattr(cfg.rewards, g), dt) for g in self.reward_groups)
         self._assist = AssistWrench(cfg.assist, spec, torch.as_tensor(torso_inertia(spec, model)), dt)
         self._torso = model.body(spec.torso_body).id
+        self.curriculum = Curriculum(cfg.curriculum, dt)
         self.commands.velocity_share = cfg.assist.velocities(0)
         self._min_height_m = cfg.terminations.min_height_m(spec)
         self.samples = self.num_diverged = 0
@@ -193,6 +194,7 @@ class HumanoidEnv(VecEnv):
             (self.state.joint_vel - velocity_before) / self.dt, self.torque, self.actuation.current, fell,
             self.hand_force_w, self.forces.hand_push_w, self.upper_body.compliant,
         )  # fmt: skip
+        self.curriculum.step(fell, self._envs_in_all)
         self.num_diverged += int(bad.sum())
         rewards, log = self._reward(bad, time_out)
         self.observer.last_action = action
@@ -212,14 +214,14 @@ class HumanoidEnv(VecEnv):
         self.upper_body.modulate(laws)
         self.actuation.send(self.state, self.joint_targets(joints, reference.position), reference.velocity)
         xfrc = self.sim.xfrc
-        self.forces.apply(xfrc, self.state, self.dt * self.episode_length_buf, self.samples)
-        if share := self.cfg.assist.share(self.samples):
+        self.forces.apply(xfrc, self.state, self.dt * self.episode_length_buf, self.curriculum.samples)
+        if share := self.cfg.assist.share(self.curriculum.samples):
             xfrc[:, self._torso] += share * self._assist(self.state, self.commands.current()).to(xfrc)
 
     def _advance(self) -> None:
         """Let commands, laws and forces go on by one control step."""
         s = self.state
-        self.commands.velocity_share = self.cfg.assist.velocities(self.samples)
+        self.commands.velocity_share = self.cfg.assist.velocities(self.curriculum.samples)
         self.commands.step(self.rng)
         if self.cfg.path.share > 0.0:
             velocity, yaw_rate = self.path.step(s.torso_pos_w[:, :2], s.heading_w, self.motions.root_velocity())
@@ -227,7 +229,7 @@ class HumanoidEnv(VecEnv):
         if self.upper_body.active:
             self.upper_body.sense(s, self.hand_force_w, self.actuation.arm_effort)
         self.upper_body.step(self.dt, self.rng)
-        self.forces.step(self.samples, self.rng)
+        self.forces.step(self.curriculum.samples, self.rng)
 
     def _reward(self, bad: torch.Tensor, time_out: torch.Tensor) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Each group's reward (N, groups), and the log. A diverged env (`bad`) has neither; it ends and is counted."""
@@ -243,7 +245,8 @@ class HumanoidEnv(VecEnv):
             at_limit = self.torque.abs() > 0.999 * self.actuation.torque_limit
             log |= self.upper_body.log | {"/law/saturated": at_limit[:, self.num_lower :].float().mean()}
         log["/episode/diverged"] = torch.tensor(float(self.num_diverged))
-        log["/curriculum/assist"] = torch.tensor(self.cfg.assist.share(self.samples))
+        log["/curriculum/assist"] = torch.tensor(self.cfg.assist.share(self.curriculum.samples))
+        log["/curriculum/samples"] = torch.tensor(float(self.curriculum.samples))
         return torch.stack(totals, 1).masked_fill(bad.unsqueeze(1), 0.0), log
 
     def _restart(self, mask: torch.Tensor, start: tuple[torch.Tensor, torch.Tensor] | None = None) -> None:
@@ -280,6 +283,8 @@ class HumanoidEnv(VecEnv):
             "torque": self.torque,
             "hand_force_w": self.hand_force_w,
             "goals": self.upper_body.parameters,
+            "mean_error": self.recorder.mean_error,
+            "ahead": self.forces.ahead(self.state.heading_w, self.curriculum.samples),
         }
 
     def _keep_final_observation(self, bad: torch.Tensor) -> None:

@@ -39,7 +39,8 @@ class ObservationConfig:
     arm_torque: str = "actor"
     """Who sees the arms' torque: actor (and so the critic), or critic alone (the paper's ablation)."""
     critic: str = "present"
-    """What critics see beside what is privileged: the present step, or all the history that actors see (the paper)."""
+    """What critics see: present (this step, what rewards are made of, and the pushes and loads to come), or history
+    (all the history that actors see, and the torso's motion; the paper)."""
     goals: bool = False
     """Whether the actor sees the arms' stiffness, null-space stiffness and alpha as they are commanded."""
     noise: NoiseConfig = field(default_factory=NoiseConfig)
@@ -86,13 +87,30 @@ def actor_terms(
     return (*terms, *laws)
 
 
-def critic_terms(num_hands: int, num_torques: int = 0) -> tuple[Term, ...]:
-    """Terms that only the critic sees, for the present step; `num_torques` arm torques that the actor does not."""
+def critic_terms(num_hands: int, num_torques: int = 0, num_feet: int = 0) -> tuple[Term, ...]:
+    """Terms that only the critic sees, for the present step; `num_torques` arm torques that the actor does not.
+
+    With `num_feet`, also what rewards are made of and what is about to happen to the robot. A critic that is surprised
+    by a push blames the actions before it (Mao et al., Variance Reduction for Reinforcement Learning in Input-Driven
+    Environments, 2019).
+    """
+    more: tuple[Term, ...] = (
+        ("mean_error", 3, 4.0),
+        ("torso_height", 1, 4.0),
+        ("foot_contact", num_feet, 1.0),
+        ("foot_height", num_feet, 10.0),
+        ("push_nearness", 1, 1.0),
+        ("push_velocity", 3, 1.0),
+        ("push_place", 2 + num_hands, 1.0),
+        ("load_nearness", 1, 1.0),
+        ("coming_load", 3 * num_hands, 0.05),
+    )
     return (
         ("torso_orientation", 4, 1.0),
         ("torso_linear_velocity", 3, 2.0),
         *((("arm_torque", num_torques, 1.0),) if num_torques else ()),
-        *((f"hand_force_{i}", 3, 0.1) for i in range(num_hands)),
+        ("hand_force", 3 * num_hands, 0.1),
+        *(more if num_feet else ()),
     )
 
 

@@ -51,7 +51,8 @@ class Observer(Stateful):
         self._default = torch.tensor([j.default_rad for j in spec.joints])
         seen = cfg.arm_torque == "actor"
         terms = actor_terms(self._joints, self._upper, seen, GOALS_PER_ARM * arms * cfg.goals, laws)
-        self._critic_terms = critic_terms(arms, 0 if seen else self._upper)
+        feet = len(spec.feet) if cfg.critic == "present" else 0
+        self._critic_terms = critic_terms(arms, 0 if seen else self._upper, feet)
         self._critic_scale = torch.cat([torch.full((width,), scale) for _, width, scale in self._critic_terms])
         self.history = ObservationHistory(terms, num_envs, cfg.history)
         self._noise = noise_amplitude(terms, cfg.noise)
@@ -85,7 +86,8 @@ class Observer(Stateful):
 
     def observe(
         self, s: RobotState, command: Command, arm_reference: torch.Tensor, torque: torch.Tensor,
-        hand_force_w: torch.Tensor, goals: LawParameters, restarted: torch.Tensor, rng: torch.Generator,
+        hand_force_w: torch.Tensor, goals: LawParameters, mean_error: torch.Tensor, ahead: torch.Tensor,
+        restarted: torch.Tensor, rng: torch.Generator,
     ) -> dict[str, torch.Tensor]:  # fmt: skip
         """The groups, by name, and what they hold added to the history.
 
@@ -96,6 +98,8 @@ class Observer(Stateful):
             torque: (N, J) joint torques [Nm].
             hand_force_w: (N, A, 3) forces on the hands, world frame [N].
             goals: What the arms' laws are asked for.
+            mean_error: (N, 3) the velocities' averaged errors, as in `StepRecord`.
+            ahead: (N, 7 + 4 A) what forces are to come, as `ExternalForces.ahead` says.
             restarted: (N,) bool, envs that have no history.
             rng: Of sensor noise.
         """
@@ -103,9 +107,13 @@ class Observer(Stateful):
         privileged = [quat_from_matrix(s.torso_rotation_w), s.torso_linear_velocity_h]
         if self.cfg.arm_torque != "actor":
             privileged.append(torque[:, -self._upper :])
-        groups = {"privileged": torch.cat((*privileged, hand_force_w.flatten(1)), 1) * self._critic_scale}
+        privileged.append(hand_force_w.flatten(1))
+        groups: dict[str, torch.Tensor] = {}
         if self.cfg.critic == "present":
             groups["present"] = present
+            height = s.height.unsqueeze(1)
+            privileged += (mean_error, height, s.foot_contact.to(height), s.foot_pos_w[:, :, 2], ahead)
+        groups["privileged"] = torch.cat(privileged, 1) * self._critic_scale
         if self._clean:
             groups["clean"] = self._clean.append(present, restarted)
         if self.cfg.noise.enabled:
@@ -115,7 +123,8 @@ class Observer(Stateful):
 
     def preview(
         self, s: RobotState, command: Command, arm_reference: torch.Tensor, torque: torch.Tensor,
-        hand_force_w: torch.Tensor, goals: LawParameters,  # noqa: ARG002 - as `observe`
+        hand_force_w: torch.Tensor, goals: LawParameters, mean_error: torch.Tensor,  # noqa: ARG002 - as `observe`
+        ahead: torch.Tensor,  # noqa: ARG002 - likewise
     ) -> torch.Tensor:  # fmt: skip
         """What actors would observe now without noise, (N, width * history); the history stays as it is."""
         return self.history.with_next(self._present(s, command, arm_reference, torque, goals))

@@ -10,6 +10,7 @@ import torch
 from cotap.checks import require_interval, require_range
 from cotap.envs.curriculum import RampConfig
 from cotap.persistence import Stateful, uniform
+from cotap.rotations import rotate_inverse
 
 _LARGEST_PITCH_RAD = 0.5
 _NEVER_S = 1e9
@@ -63,19 +64,21 @@ class Pushes(Stateful):
         dt: Control step [s].
     """
 
-    STATE = ("force_w", "place", "_left_s", "_next_s")
+    STATE = ("force_w", "place", "_left_s", "_next_s", "_coming_w", "_coming_place", "_coming_s")
 
     def __init__(
         self, cfg: PushConfig, num_hands: int, num_links: int, mass_kg: float, num_envs: int, dt: float
     ) -> None:
         cfg.check()
         self.cfg, self._dt, self._mass = cfg, dt, mass_kg
-        self._num_hands, self._num_links = num_hands, num_links
+        self._num_hands, self._num_links, self._share = num_hands, num_links, 0.0
         self.force_w = torch.zeros(num_envs, 3)
         """(N, 3) of the present or last push [N]."""
         self.place = torch.zeros(num_envs, dtype=torch.long)
         """(N,) where it acts."""
         self._left_s, self._next_s = torch.zeros(num_envs), torch.full((num_envs,), _NEVER_S)
+        self._coming_w, self._coming_s = torch.zeros(num_envs, 3), torch.zeros(num_envs)
+        self._coming_place = torch.zeros_like(self.place)
 
     def reset(self, mask: torch.Tensor, rng: torch.Generator) -> None:
         """An episode begins in the envs of `mask`; the first push comes after an interval."""
@@ -84,19 +87,26 @@ class Pushes(Stateful):
             return
         spared = torch.rand(n, generator=rng, device=rng.device) >= self.cfg.episode_share
         self._left_s[mask] = 0.0
-        self._next_s[mask] = torch.where(spared, _NEVER_S, uniform(rng, *self.cfg.interval_s, n))
+        self._draw(mask, rng)
+        self._next_s[mask] = self._next_s[mask].masked_fill(spared, _NEVER_S)
 
     def step(self, samples: float, rng: torch.Generator) -> None:
         """Advance by one control step, and push where it is time. `samples` says how far training has come."""
         if not self.cfg.enabled:
             return
+        self._share = self.cfg.ramp.share(samples)
         self._left_s = (self._left_s - self._dt).clamp_min(0.0)
         self._next_s = self._next_s - self._dt
         due = self._next_s <= 0.0
         if due.any():
-            self._push(due, self.cfg.ramp.share(samples), rng)
+            self.place = torch.where(due, self._coming_place, self.place)
+            force_w = self._share * self._mass * self._coming_w / self._coming_s.clamp_min(1e-6).unsqueeze(1)
+            self.force_w = torch.where(due.unsqueeze(1), force_w, self.force_w)
+            self._left_s = torch.where(due, self._coming_s, self._left_s)
+            self._draw(due, rng)
 
-    def _push(self, mask: torch.Tensor, share: float, rng: torch.Generator) -> None:
+    def _draw(self, mask: torch.Tensor, rng: torch.Generator) -> None:
+        """Draw the coming pushes of the envs of `mask`, one ahead, so that critics can see what will come."""
         cfg, n = self.cfg, int(mask.sum())
         yaw, pitch = uniform(rng, -math.pi, math.pi, n), uniform(rng, -_LARGEST_PITCH_RAD, _LARGEST_PITCH_RAD, n)
         direction = torch.stack((pitch.cos() * yaw.cos(), pitch.cos() * yaw.sin(), pitch.sin()), -1)
@@ -104,13 +114,23 @@ class Pushes(Stateful):
         hand = torch.randint(1, 1 + self._num_hands, (n,), generator=rng, device=rng.device)
         link = torch.randint(self._num_links, (n,), generator=rng, device=rng.device) + 1 + self._num_hands
         on_hand, on_link = kind < cfg.hand_share, kind >= 1.0 - cfg.link_share
-        self.place[mask] = torch.where(on_hand, hand, torch.where(on_link, link, torch.zeros_like(hand)))
-        impulse = share * self._mass * uniform(rng, *cfg.velocity, n)
-        duration = uniform(rng, *cfg.duration_s, n)
-        self.force_w[mask] = direction * (impulse / duration).unsqueeze(1)
-        self._left_s[mask] = duration
+        self._coming_place[mask] = torch.where(on_hand, hand, torch.where(on_link, link, torch.zeros_like(hand)))
+        self._coming_w[mask] = direction * uniform(rng, *cfg.velocity, n).unsqueeze(1)
+        self._coming_s[mask] = uniform(rng, *cfg.duration_s, n)
         self._next_s[mask] = uniform(rng, *cfg.interval_s, n)
 
     def current(self) -> torch.Tensor:
         """Force (N, 3) [N] of the coming control step, world frame: the mean over it, so that the impulse is exact."""
         return self.force_w * (self._left_s / self._dt).clamp(0.0, 1.0).unsqueeze(1)
+
+    def ahead(self, heading_w: torch.Tensor) -> torch.Tensor:
+        """What critics see of the push that is on, or else of the one that comes: how near it is (1 as it begins, 1/e
+        a second before), and by as much its velocity (3) in the heading frame [m/s] and whether it is on the base, on
+        each hand, or on a link; (N, 6 + hands)."""
+        on = self._left_s > 0.0
+        left_w = self.force_w * (self._left_s / self._mass).unsqueeze(1)
+        velocity_w = torch.where(on.unsqueeze(1), left_w, self._share * self._coming_w)
+        place = torch.where(on, self.place, self._coming_place).clamp_max(1 + self._num_hands)
+        near = torch.where(on, 1.0, (-self._next_s).exp()).unsqueeze(1)
+        kind = torch.nn.functional.one_hot(place, 2 + self._num_hands)
+        return near * torch.cat((torch.ones_like(near), rotate_inverse(heading_w, velocity_w), kind), 1)

@@ -25,6 +25,7 @@ def env_state(env: HumanoidEnv) -> dict[str, Any]:
         "episode_length": env.episode_length_buf.clone(),
         "torque": env.torque,
         "observations": dict(env.get_observations().items()),
+        "curriculum": env.curriculum.state_dict(),
         "counters": {"samples": env.samples, "num_diverged": env.num_diverged},
         "rng": env.rng.get_state(),
     })  # fmt: skip
@@ -41,6 +42,7 @@ def restore_env(env: HumanoidEnv, state: dict[str, Any]) -> TensorDict:
         part.load_state_dict(state["parts"][name])
     env.episode_length_buf = restored("episode_length", state["episode_length"], env.episode_length_buf)
     env.torque = restored("torque", state["torque"], env.torque)
+    env.curriculum.load_state_dict(state["curriculum"])
     env.samples = state["counters"]["samples"]
     env.num_diverged = state["counters"]["num_diverged"]
     if state["rng"].shape == env.rng.get_state().shape:  # of the same kind of device

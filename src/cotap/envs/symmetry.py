@@ -22,6 +22,11 @@ _SIGNS: dict[str, tuple[float, ...]] = {
     "cos_phase": (-1.0,),
     "torso_orientation": (1.0, *_AXIAL),
     "torso_linear_velocity": _VECTOR,
+    "mean_error": (1.0, -1.0, -1.0),
+    "torso_height": (1.0,),
+    "push_nearness": (1.0,),
+    "push_velocity": _VECTOR,
+    "load_nearness": (1.0,),
 }
 
 
@@ -39,6 +44,14 @@ def _term_reflection(spec: RobotSpec, name: str, width: int) -> Reflection:
         return joint_reflection(spec, spec.joint_names)
     if name in ("reference_arm_position", "arm_torque"):
         return joint_reflection(spec, spec.upper_joints)
+    if name in ("foot_contact", "foot_height"):
+        return Reflection(_swapped([foot.side for foot in spec.feet]), torch.ones(width))
+    if name in ("hand_force", "coming_load"):
+        hands = 3 * _swapped([arm.side for arm in spec.arms]).unsqueeze(1) + torch.arange(3)
+        return Reflection(hands.flatten(), torch.tensor(_VECTOR * len(spec.arms)))
+    if name == "push_place":  # the base, each hand, a link
+        hands = 1 + _swapped([arm.side for arm in spec.arms])
+        return Reflection(torch.cat((torch.tensor([0]), hands, torch.tensor([width - 1]))), torch.ones(width))
     if name in ("goals", "law_alpha", "law_log_stiffness"):
         return law_reflection(spec, width)
     return Reflection(torch.arange(width), torch.tensor(_SIGNS[name]))
@@ -47,13 +60,12 @@ def _term_reflection(spec: RobotSpec, name: str, width: int) -> Reflection:
 def law_reflection(spec: RobotSpec, width: int) -> Reflection:
     """Reflection of laws' parameters, arm by arm: diagonal stiffness is its own mirror image; arms change places."""
     arms = torch.arange(width).reshape(len(spec.arms), width // len(spec.arms))
-    return Reflection(arms[_swapped_arms(spec)].flatten(), torch.ones(width))
+    return Reflection(arms[_swapped([arm.side for arm in spec.arms])].flatten(), torch.ones(width))
 
 
-def _swapped_arms(spec: RobotSpec) -> torch.Tensor:
-    """Which arm each arm becomes."""
+def _swapped(sides: list[str]) -> torch.Tensor:
+    """Which arm or foot each of them becomes."""
     swap = {"left": "right", "right": "left"}
-    sides = [arm.side for arm in spec.arms]
     return torch.tensor([sides.index(swap[s]) for s in sides])
 
 
@@ -63,10 +75,5 @@ def actor_reflection(spec: RobotSpec, terms: tuple[Term, ...], history: int) -> 
 
 
 def critic_reflection(spec: RobotSpec, terms: tuple[Term, ...]) -> Reflection:
-    """Of what only the critic sees. Hands change places."""
-    body = [t for t in terms if not t[0].startswith("hand_force")]
-    parts = [_term_reflection(spec, name, width) for name, width, _ in body]
-    hands = Reflection(
-        (3 * _swapped_arms(spec).unsqueeze(1) + torch.arange(3)).flatten(), torch.tensor(_VECTOR * len(spec.arms))
-    )
-    return join([*parts, hands])
+    """Of what only the critic sees."""
+    return join([_term_reflection(spec, name, width) for name, width, _ in terms])

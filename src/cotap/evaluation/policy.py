@@ -11,7 +11,14 @@ from typing import Any
 import torch
 
 from cotap.agents.actors import AgentLayout, DualActorCritic
-from cotap.agents.checkpoint import MALFORMED, CheckpointError, load_checkpoint, load_weights, require_parts
+from cotap.agents.checkpoint import (
+    MALFORMED,
+    CheckpointError,
+    load_checkpoint,
+    load_weights,
+    require_layout,
+    require_parts,
+)
 from cotap.checks import quoted, reason_of, require_one_of, require_positive_int
 from cotap.configs import from_plain, to_plain
 from cotap.envs import HumanoidEnvConfig
@@ -100,6 +107,12 @@ def load_policy(path: Path | str) -> Policy:
         ) from error
     model.eval()
     return Policy(model, layout, content["kind"], env_config)
+
+
+def require_acting(path: Path | str, policy: Policy, layout: dict[str, Any]) -> None:
+    """Raise CheckpointError unless `policy`, from `path`, can act in an environment of this layout; what only critics
+    see may differ."""
+    require_layout(path, policy.layout, {key: value for key, value in layout.items() if key != "critic_terms"})
 
 
 def _require_fitting(networks: AgentLayout, layout: dict[str, Any]) -> None:

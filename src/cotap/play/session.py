@@ -10,12 +10,12 @@ from typing import Any
 import torch
 
 from cotap.agents.actors import as_dict
-from cotap.agents.checkpoint import require_layout, sha256
+from cotap.agents.checkpoint import sha256
 from cotap.checks import quoted
 from cotap.compliance.laws import LAWS, LawConfig, reads
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.scripted_forces import ForceProfile
-from cotap.evaluation.policy import Policy, load_policy
+from cotap.evaluation.policy import Policy, load_policy, require_acting
 from cotap.evaluation.protocol import select_motion
 from cotap.evaluation.rollout import reference_actions
 from cotap.evaluation.undisturbed import disable_disturbances
@@ -153,7 +153,7 @@ class Session:
         if name not in self._loaded:
             path = self._checkpoints[name]
             policy = load_policy(path)
-            require_layout(path, policy.layout, self.env.layout())
+            require_acting(path, policy, self.env.layout())
             self._loaded[name] = policy
         return self._loaded[name]
 
