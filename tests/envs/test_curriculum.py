@@ -97,7 +97,11 @@ def test_nothing_changes_while_many_fall(make_env, robot):
     assert done.tolist() == [True, False, False, False]
     for _ in range(30):
         _, _, _, extras = env.step(zeros(env))
-    assert (env.samples, env.curriculum.samples, env.forces.pushes._share) == (4 * 31, 0, 0.0)
+    assert (env.samples, env.curriculum.samples) == (4 * 31, 0)
+    env.forces.pushes._next_s[:] = 0.0
+    env.step(zeros(env))
+    assert env.forces.pushes._left_s.min() > 0.0
+    assert not env.forces.pushes.current().any()  # pushes of no size
     assert extras["log"]["/curriculum/assist"].item() == 1.0
     assert extras["log"]["/curriculum/samples"].item() == 0.0
 

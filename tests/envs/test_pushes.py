@@ -119,7 +119,7 @@ def test_critics_see_what_comes_before_it_comes(rng):
     turned = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]).expand(300, 3, 3)
     for _ in range(10):  # of 15 until the push
         p.step(50.0, rng)
-    before, total = p.ahead(turned), torch.zeros(300, 3)
+    before, total = p.ahead(turned, 50.0), torch.zeros(300, 3)
     near = math.exp(-0.1)
     torch.testing.assert_close(before[:, 0], torch.full((300,), near), rtol=1e-4, atol=0.0)
     for _ in range(9):
@@ -138,7 +138,7 @@ def test_critics_see_what_is_left_of_a_push(rng):
     run(p, rng, 15)
     sizes = []
     for _ in range(8):
-        seen = p.ahead(upright)[0]
+        seen = p.ahead(upright, 1e9)[0]
         sizes.append((round(seen[0].item(), 3), round(seen[1:4].norm().item(), 3)))
         p.step(1e9, rng)
     on = [size for near, size in sizes if near == 1.0]
@@ -149,7 +149,7 @@ def test_critics_see_what_is_left_of_a_push(rng):
 def test_where_no_push_comes_critics_see_none(rng):
     p = pushes(5, episode_share=0.0)
     run(p, rng, 3)
-    assert not p.ahead(torch.eye(3).expand(5, 3, 3)).any()
+    assert not p.ahead(torch.eye(3).expand(5, 3, 3), 1e9).any()
 
 
 def test_pushes_of_some_episodes_only(rng):

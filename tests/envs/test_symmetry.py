@@ -177,7 +177,7 @@ def test_what_is_to_come_is_mirrored(make_env, robot):
     )
     env = make_env(1, robot=robot, forces=forces)
     pushes, loads = env.forces.pushes, env.forces.hand_loads
-    pushes._share, pushes._next_s[:], loads._remaining_s[:] = 1.0, 0.5, 1.0
+    pushes._next_s[:], loads._remaining_s[:] = 0.5, 1.0
     pushes._coming_place[:], pushes._coming_w[0] = 1, env.state.heading_w[0] @ torch.tensor([0.1, -0.6, 0.2])
     loads._coming_h[0] = torch.tensor([[1.0, 2.0, 3.0], [-4.0, 5.0, -6.0]])
     seen = env.observer.observe(

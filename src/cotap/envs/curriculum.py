@@ -13,6 +13,9 @@ from cotap.envs.state import RobotState
 from cotap.robots import RobotSpec
 from cotap.rotations import rotate
 
+_FALLS_OVER_S = 10.0
+"""Time over which falls are averaged."""
+
 
 @dataclass
 class RampConfig:
@@ -72,10 +75,6 @@ class Curriculum:
     def load_state_dict(self, state: dict[str, float]) -> None:
         """Take over what `state_dict` returned. Raises KeyError or TypeError for something else."""
         self.samples, self.falls_per_s = int(state["samples"]), float(state["falls_per_s"])
-
-
-_FALLS_OVER_S = 10.0
-"""Time over which falls are averaged."""
 
 
 @dataclass

@@ -95,7 +95,7 @@ class ExternalForces:
 
     def ahead(self, heading_w: torch.Tensor, samples: float) -> torch.Tensor:
         """What critics see of pushes and loads to come, (N, 7 + 4 hands) as their `ahead` say."""
-        return torch.cat((self.pushes.ahead(heading_w), self.hand_loads.ahead(samples)), 1)
+        return torch.cat((self.pushes.ahead(heading_w, samples), self.hand_loads.ahead(samples)), 1)
 
     def apply(self, xfrc: torch.Tensor, s: RobotState, time_s: torch.Tensor, samples: float) -> None:
         """Write the wrenches of the coming control step.

@@ -71,7 +71,7 @@ class Pushes(Stateful):
     ) -> None:
         cfg.check()
         self.cfg, self._dt, self._mass = cfg, dt, mass_kg
-        self._num_hands, self._num_links, self._share = num_hands, num_links, 0.0
+        self._num_hands, self._num_links = num_hands, num_links
         self.force_w = torch.zeros(num_envs, 3)
         """(N, 3) of the present or last push [N]."""
         self.place = torch.zeros(num_envs, dtype=torch.long)
@@ -94,13 +94,13 @@ class Pushes(Stateful):
         """Advance by one control step, and push where it is time. `samples` says how far training has come."""
         if not self.cfg.enabled:
             return
-        self._share = self.cfg.ramp.share(samples)
         self._left_s = (self._left_s - self._dt).clamp_min(0.0)
         self._next_s = self._next_s - self._dt
         due = self._next_s <= 0.0
         if due.any():
             self.place = torch.where(due, self._coming_place, self.place)
-            force_w = self._share * self._mass * self._coming_w / self._coming_s.clamp_min(1e-6).unsqueeze(1)
+            impulse = self.cfg.ramp.share(samples) * self._mass * self._coming_w
+            force_w = impulse / self._coming_s.clamp_min(1e-6).unsqueeze(1)
             self.force_w = torch.where(due.unsqueeze(1), force_w, self.force_w)
             self._left_s = torch.where(due, self._coming_s, self._left_s)
             self._draw(due, rng)
@@ -123,13 +123,13 @@ class Pushes(Stateful):
         """Force (N, 3) [N] of the coming control step, world frame: the mean over it, so that the impulse is exact."""
         return self.force_w * (self._left_s / self._dt).clamp(0.0, 1.0).unsqueeze(1)
 
-    def ahead(self, heading_w: torch.Tensor) -> torch.Tensor:
+    def ahead(self, heading_w: torch.Tensor, samples: float) -> torch.Tensor:
         """What critics see of the push that is on, or else of the one that comes: how near it is (1 as it begins, 1/e
         a second before), and by as much its velocity (3) in the heading frame [m/s] and whether it is on the base, on
         each hand, or on a link; (N, 6 + hands)."""
         on = self._left_s > 0.0
         left_w = self.force_w * (self._left_s / self._mass).unsqueeze(1)
-        velocity_w = torch.where(on.unsqueeze(1), left_w, self._share * self._coming_w)
+        velocity_w = torch.where(on.unsqueeze(1), left_w, self.cfg.ramp.share(samples) * self._coming_w)
         place = torch.where(on, self.place, self._coming_place).clamp_max(1 + self._num_hands)
         near = torch.where(on, 1.0, (-self._next_s).exp()).unsqueeze(1)
         kind = torch.nn.functional.one_hot(place, 2 + self._num_hands)
