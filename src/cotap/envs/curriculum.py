@@ -44,10 +44,11 @@ class RampConfig:
 
 @dataclass
 class CurriculumConfig:
-    """When what changes with the samples goes on, and when it waits."""
+    """When disturbances grow with the samples, and when they wait. The assistance does not wait: robots that keep it
+    lean on it."""
 
     max_falls_per_s: float = 0.02
-    """Falls per second and env above which no disturbance grows and no assistance fades."""
+    """Falls per second and env above which no disturbance grows."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
@@ -55,7 +56,7 @@ class CurriculumConfig:
 
 
 class Curriculum:
-    """How far training has come: the samples, but for those that were taken while robots fell too often."""
+    """How far disturbances have grown: the samples, but for those that were taken while robots fell too often."""
 
     def __init__(self, cfg: CurriculumConfig, dt: float) -> None:
         self._cfg, self._dt = cfg, dt

@@ -215,13 +215,13 @@ class HumanoidEnv(VecEnv):
         self.actuation.send(self.state, self.joint_targets(joints, reference.position), reference.velocity)
         xfrc = self.sim.xfrc
         self.forces.apply(xfrc, self.state, self.dt * self.episode_length_buf, self.curriculum.samples)
-        if share := self.cfg.assist.share(self.curriculum.samples):
+        if share := self.cfg.assist.share(self.samples):
             xfrc[:, self._torso] += share * self._assist(self.state, self.commands.current()).to(xfrc)
 
     def _advance(self) -> None:
         """Let commands, laws and forces go on by one control step."""
         s = self.state
-        self.commands.velocity_share = self.cfg.assist.velocities(self.curriculum.samples)
+        self.commands.velocity_share = self.cfg.assist.velocities(self.samples)
         self.commands.step(self.rng)
         if self.cfg.path.share > 0.0:
             velocity, yaw_rate = self.path.step(s.torso_pos_w[:, :2], s.heading_w, self.motions.root_velocity())
@@ -245,7 +245,7 @@ class HumanoidEnv(VecEnv):
             at_limit = self.torque.abs() > 0.999 * self.actuation.torque_limit
             log |= self.upper_body.log | {"/law/saturated": at_limit[:, self.num_lower :].float().mean()}
         log["/episode/diverged"] = torch.tensor(float(self.num_diverged))
-        log["/curriculum/assist"] = torch.tensor(self.cfg.assist.share(self.curriculum.samples))
+        log["/curriculum/assist"] = torch.tensor(self.cfg.assist.share(self.samples))
         log["/curriculum/samples"] = torch.tensor(float(self.curriculum.samples))
         return torch.stack(totals, 1).masked_fill(bad.unsqueeze(1), 0.0), log
 
