@@ -329,14 +329,14 @@ def _guide(env: Any, options: DistillOptions, base: dict[str, Any] | None) -> An
     """The frozen base; of a resumed run, one whose weights the checkpoint brings."""
     from cotap.agents.actors import DualActorCritic
     from cotap.agents.distillation import Guide
-    from cotap.agents.refit import take_over
+    from cotap.agents.refit import REFITTED, take_over
     from cotap.agents.runner import layout_of
 
     training = options.training
     model = DualActorCritic(layout_of(env, training.ppo.symmetric), training.ppo.hidden, training.ppo.initial_std)
     if base is not None:
-        others = options.recipe in OTHER_TERMS or training.env.upper_body.modulation.kind != "none"
-        take_over(options.base_checkpoint, base, model, env, others)
+        acts_otherwise = options.recipe in OTHER_TERMS or training.env.upper_body.modulation.kind != "none"
+        take_over(options.base_checkpoint, base, model, env, REFITTED if acts_otherwise else ("critic_terms",))
     return Guide(model.to(training.device), training.distillation)
 
 

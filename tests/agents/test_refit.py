@@ -12,7 +12,7 @@ from rsl_rl.modules import EmpiricalNormalization
 
 from cotap.agents.actors import DualActorCritic, Observations, as_dict
 from cotap.agents.checkpoint import CheckpointError
-from cotap.agents.refit import columns, take_over
+from cotap.agents.refit import REFITTED, columns, take_over
 from cotap.agents.runner import layout_of
 from cotap.compliance.laws import LawConfig
 from cotap.envs import HumanoidEnv
@@ -68,7 +68,7 @@ def test_what_is_new_is_ignored_at_first(make_env: MakeEnv, symmetric: bool, noi
     before = make_env(observations=ObservationConfig(noise=noisy, critic=critic))
     now = make_env(observations=ObservationConfig(goals=True, noise=noisy, critic=critic))
     old, new = trained(before, symmetric), fresh(now, symmetric)
-    assert take_over("c.pt", content(before, old), new, now, other_terms=True)
+    assert take_over("c.pt", content(before, old), new, now, other=REFITTED)
     x = observations(now, 2)
     new_columns = {"privileged": 0, "present": GOALS, "policy": HISTORY * GOALS, "clean": HISTORY * GOALS}
     without = {k: v[:, : v.shape[1] - new_columns[k]] for k, v in x.items()}
@@ -84,7 +84,7 @@ def test_what_has_gone_counts_as_at_its_mean(make_env: MakeEnv, symmetric: bool)
     before = make_env()
     now = make_env(observations=ObservationConfig(arm_torque="critic"))
     old, new = trained(before, symmetric), fresh(now, symmetric)
-    take_over("c.pt", content(before, old), new, now, other_terms=True)
+    take_over("c.pt", content(before, old), new, now, other=REFITTED)
     x = observations(before, 2)
     blind = x["policy"].clone()
     blind[:, -HISTORY * TORQUES :] = mean(old)[-HISTORY * TORQUES :]
@@ -99,7 +99,7 @@ def test_critics_keep_the_weights_of_what_they_alone_still_see(make_env: MakeEnv
     before = make_env(observations=ObservationConfig(critic=critic))
     now = make_env(observations=ObservationConfig(arm_torque="critic", critic=critic))
     old, new = trained(before, True), fresh(now, True)
-    take_over("c.pt", content(before, old), new, now, other_terms=True)
+    take_over("c.pt", content(before, old), new, now, other=REFITTED)
     seen, kept = STEP * steps, (STEP - TORQUES) * steps
     was, has = (m.state_dict()["critics.upper.weights.0"] for m in (old, new))
     newest = was[:, kept:seen].reshape(-1, steps, TORQUES)[:, -1]
@@ -120,7 +120,7 @@ def test_critics_keep_the_statistics_of_what_they_alone_still_see(
     before = make_env(observations=ObservationConfig(noise=noisy, critic=critic))
     now = make_env(observations=ObservationConfig(arm_torque="critic", noise=noisy, critic=critic))
     old, new = trained(before, True), fresh(now, True)
-    take_over("c.pt", content(before, old), new, now, other_terms=True)
+    take_over("c.pt", content(before, old), new, now, other=REFITTED)
     was, has = old.state_dict(), new.state_dict()
     for key in ("_mean", "_std", "_var"):
         mine = has[f"normalizers.privileged.{key}"][:, 7 : 7 + TORQUES]
@@ -130,10 +130,25 @@ def test_critics_keep_the_statistics_of_what_they_alone_still_see(
         assert torch.equal(rest, was[f"normalizers.privileged.{key}"])
 
 
+def test_what_only_critics_see_may_change_alone(make_env: MakeEnv):
+    """As from a base whose critics saw less; actors act as before."""
+    now = make_env()
+    old, new = trained(now, True), fresh(now, True)
+    given = content(now, old)
+    given["layout"]["critic_terms"] = [["scent", width, 1.0] for _, width, _ in given["layout"]["critic_terms"]]
+    assert take_over("c.pt", given, new, now, other=("critic_terms",))
+    x = observations(now, 2)
+    torch.testing.assert_close(new.eval()(x), old(x))
+    assert not new.state_dict()["critics.lower.weights.0"][:, STEP:].any()
+    with pytest.raises(CheckpointError, match="another terms"):
+        take_over("c.pt", content(now, old), fresh(now, True), make_env(observations=ObservationConfig(goals=True)),
+                  other=("critic_terms",))  # fmt: skip
+
+
 def test_statistics_of_what_is_new_are_those_of_the_envs(make_env: MakeEnv):
     before, now = make_env(), make_env(64, observations=ObservationConfig(goals=True))
     new = fresh(now, True)
-    take_over("c.pt", content(before, trained(before, True)), new, now, other_terms=True)
+    take_over("c.pt", content(before, trained(before, True)), new, now, other=REFITTED)
     goals = now.get_observations()["policy"][:, -GOALS:]
     both = torch.cat((goals, goals[:, [5, 6, 7, 8, 9, 0, 1, 2, 3, 4]]))
     torch.testing.assert_close(mean(new)[-GOALS:], both.mean(0), atol=1e-4, rtol=1e-4)
@@ -152,35 +167,37 @@ def test_columns_run_term_by_term_and_oldest_first():
 def test_nothing_is_refitted_where_nothing_differs(make_env: MakeEnv):
     env = make_env()
     old, new = trained(env, True), fresh(env, True)
-    assert not take_over("c.pt", content(env, old), new, env, other_terms=True)
+    assert not take_over("c.pt", content(env, old), new, env, other=REFITTED)
     assert all(torch.equal(v, old.state_dict()[k]) for k, v in new.state_dict().items())
 
 
 @pytest.mark.parametrize(
-    ("saved", "other_terms", "needle"),
+    ("saved", "other", "needle"),
     [
-        ({}, False, "another terms"),
-        ({"robot": "g1"}, True, "another robot: 'g1', here 'h1'"),
-        ({"history": 3}, True, "another history: 3, here 5"),
-        ({"terms": [["a"]]}, True, "other networks"),
-        ({"terms": torch.ones(3)}, True, "other networks"),
-        ({"critic_terms": None}, True, "other networks"),
+        ({}, (), "another terms"),
+        ({"robot": "g1"}, REFITTED, "another robot: 'g1', here 'h1'"),
+        ({"history": 3}, REFITTED, "another history: 3, here 5"),
+        ({"terms": [["a"]]}, REFITTED, "other networks"),
+        ({"terms": torch.ones(3)}, REFITTED, "other networks"),
+        ({"critic_terms": None}, REFITTED, "other networks"),
     ],
 )
-def test_what_cannot_be_refitted_is_refused(make_env: MakeEnv, saved: dict[str, Any], other_terms: bool, needle: str):
+def test_what_cannot_be_refitted_is_refused(
+    make_env: MakeEnv, saved: dict[str, Any], other: tuple[str, ...], needle: str
+):
     before, now = make_env(), make_env(observations=ObservationConfig(goals=True))
     given = content(before, trained(before, True))
     given["layout"] |= saved
     new = fresh(now, True)
     with pytest.raises(CheckpointError, match=needle):
-        take_over("c.pt", given, new, now, other_terms)
+        take_over("c.pt", given, new, now, other)
 
 
 def test_networks_of_another_width_are_refused(make_env: MakeEnv):
     before, now = make_env(), make_env(observations=ObservationConfig(goals=True))
     wide = DualActorCritic(layout_of(now), (32, 8), 1.0)
     with pytest.raises(CheckpointError, match="other networks"):
-        take_over("c.pt", content(before, trained(before, True)), wide, now, other_terms=True)
+        take_over("c.pt", content(before, trained(before, True)), wide, now, other=REFITTED)
 
 
 @pytest.mark.parametrize("symmetric", [True, False])
@@ -189,7 +206,7 @@ def test_new_actions_are_zero_at_first(make_env: MakeEnv, symmetric: bool, kind:
     laws = [LawConfig("cotap", alpha=0.5) for _ in range(2)]
     before, now = make_env(), make_env(upper_body=UpperBodyConfig(*laws, modulation=ModulationConfig(kind)))
     old, new = trained(before, symmetric), fresh(now, symmetric)
-    assert take_over("c.pt", content(before, old), new, now, other_terms=True)
+    assert take_over("c.pt", content(before, old), new, now, other=REFITTED)
     x = observations(now, 2)
     shown, joints = now.num_actions - before.num_actions, before.num_actions
     steps = {"privileged": 0, "present": 1, "policy": HISTORY, "clean": HISTORY}
@@ -205,4 +222,4 @@ def test_new_actions_are_zero_at_first(make_env: MakeEnv, symmetric: bool, kind:
     last = "output_weight" if symmetric else "mlp.4.weight"
     assert float(dict(new.actors["upper"].named_parameters())[last].grad[arms:].abs().max()) > 0.0  # they can learn
     with pytest.raises(CheckpointError, match="other networks"):
-        take_over("c.pt", content(now, new), fresh(before, symmetric), before, other_terms=True)
+        take_over("c.pt", content(now, new), fresh(before, symmetric), before, other=REFITTED)

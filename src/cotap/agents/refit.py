@@ -4,6 +4,7 @@ Actions that it did not have are zero at first."""
 from __future__ import annotations
 
 import json
+from collections.abc import Collection
 from typing import Any
 
 import torch
@@ -34,16 +35,18 @@ def columns(layout: dict[str, Any]) -> Columns:
     return {"policy": seen, "clean": seen, "present": present, "privileged": privileged}
 
 
-def take_over(path: str, content: dict[str, Any], model: DualActorCritic, env: Any, other_terms: bool = False) -> bool:
-    """Give `model` the weights of a checkpoint, refitted if its observation has other terms and `other_terms` says that
-    it may. Returns whether they were.
+def take_over(
+    path: str, content: dict[str, Any], model: DualActorCritic, env: Any, other: Collection[str] = ()
+) -> bool:
+    """Give `model` the weights of a checkpoint, refitted if its layout is another in what `other`, a part of
+    `REFITTED`, names. Returns whether they were.
 
     Raises:
         CheckpointError: it was trained for something else.
     """
     present, saved = json.loads(json.dumps(env.layout())), content["layout"]
-    refits = other_terms and any(not same(saved.get(key), present.get(key)) for key in REFITTED)
-    require_layout(path, saved, {k: v for k, v in present.items() if not (refits and k in REFITTED)})
+    refits = any(not same(saved.get(key), present.get(key)) for key in other)
+    require_layout(path, saved, {k: v for k, v in present.items() if k not in other})
     try:
         if refits:
             # For the statistics of what is new.

@@ -46,7 +46,7 @@ class HumanoidEnv(VecEnv):
     One step, in order: reference motion advances, actions become targets, arms' laws are asked, forces are set;
     physics; state read once; commands and forces advance; falls, divergence and time-outs found; rewards from the
     record of the step; ended envs restart; observations. After a step, everything in an observation is current; foot
-    sensors (rewards only) lag one physics step.
+    sensors (rewards and critics only) lag one physics step.
 
     `action_slices` and `reward_groups` tell agents, by name, which actions and which reward are theirs; `step` returns
     the sum of the groups' rewards, and each group's in `extras["group_rewards"]` (N, groups).
