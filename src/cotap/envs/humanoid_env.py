@@ -270,7 +270,11 @@ class HumanoidEnv(VecEnv):
 
     def _observe(self, restarted: torch.Tensor) -> TensorDict:
         """Observe the present; envs in `restarted` (N,) have no history before it."""
-        groups = self.observer.observe(**self._observed(), restarted=restarted, rng=self.rng)
+        ahead = self.forces.ahead(self.state.heading_w, self.curriculum.samples)
+        errors = self.recorder.mean_error
+        groups = self.observer.observe(
+            **self._observed(), mean_error=errors, ahead=ahead, restarted=restarted, rng=self.rng
+        )
         self._observations = TensorDict(cast(Any, groups), batch_size=[self.num_envs])
         return self._observations
 
@@ -283,8 +287,6 @@ class HumanoidEnv(VecEnv):
             "torque": self.torque,
             "hand_force_w": self.hand_force_w,
             "goals": self.upper_body.parameters,
-            "mean_error": self.recorder.mean_error,
-            "ahead": self.forces.ahead(self.state.heading_w, self.curriculum.samples),
         }
 
     def _keep_final_observation(self, bad: torch.Tensor) -> None:

@@ -123,8 +123,7 @@ class Observer(Stateful):
 
     def preview(
         self, s: RobotState, command: Command, arm_reference: torch.Tensor, torque: torch.Tensor,
-        hand_force_w: torch.Tensor, goals: LawParameters, mean_error: torch.Tensor,  # noqa: ARG002 - as `observe`
-        ahead: torch.Tensor,  # noqa: ARG002 - likewise
+        hand_force_w: torch.Tensor, goals: LawParameters,  # noqa: ARG002 - as `observe`
     ) -> torch.Tensor:  # fmt: skip
         """What actors would observe now without noise, (N, width * history); the history stays as it is."""
         return self.history.with_next(self._present(s, command, arm_reference, torque, goals))

@@ -77,6 +77,7 @@ class Pushes(Stateful):
         self.place = torch.zeros(num_envs, dtype=torch.long)
         """(N,) where it acts."""
         self._left_s, self._next_s = torch.zeros(num_envs), torch.full((num_envs,), _NEVER_S)
+        # The next push: its impulse over the robot's mass [m/s], how long it will last [s], and where it will act.
         self._coming_w, self._coming_s = torch.zeros(num_envs, 3), torch.zeros(num_envs)
         self._coming_place = torch.zeros_like(self.place)
 
