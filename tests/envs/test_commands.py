@@ -109,8 +109,8 @@ def test_velocities_are_approached_at_their_rates(rng):
     assert commands.current().velocity_h.tolist() == [[pytest.approx(0.5), pytest.approx(-0.1)]]
 
 
-def test_a_robot_told_to_stand_slows_down_and_ends_its_step(rng):
-    """From 0.3 m/s at 1.5 m/s^2: 0.2 s, then on to the next double support; a new command sets it going from there."""
+def test_a_robot_told_to_stand_slows_down_and_walks_on_the_spot_for_a_stride(rng):
+    """From 0.3 m/s at 1.5 m/s^2: 0.2 s, a stride, then on to double support; a new command sets it going from there."""
     commands = source(1)
     walk = (torch.tensor([[0.3, 0.0]]), torch.zeros(1), torch.zeros(1), torch.tensor([NOMINAL]))
     commands.override(*walk)
@@ -120,7 +120,7 @@ def test_a_robot_told_to_stand_slows_down_and_ends_its_step(rng):
     commands.gait.phase = torch.tensor([0.12])
     commands.override(torch.zeros(1, 2), torch.zeros(1), torch.ones(1), torch.tensor([NOMINAL]))
     phases, stands, speeds = [], [], []
-    for _ in range(30):
+    for _ in range(70):
         commands.step(rng)
         c = commands.current()
         phases.append(float(c.phase))
@@ -128,10 +128,11 @@ def test_a_robot_told_to_stand_slows_down_and_ends_its_step(rng):
         speeds.append(float(c.velocity_h[0, 0]))
     assert speeds[8] == pytest.approx(0.03)
     assert speeds[9] == pytest.approx(0.0, abs=1e-6)
-    # 0.38 of a stride of 0.8 s is 15.2 control steps: the sixteenth reaches double support.
-    assert stands == [0.0] * 15 + [1.0] * 15
-    assert phases[14] == pytest.approx(0.12 + 15 * 0.02 / 0.8)
-    assert phases[15:] == [0.5] * 15
+    # A stride of 0.8 s is 40 control steps, and ends at 1.345 or 1.37; from 0.12 to 1.5, where both feet are down, are
+    # 55.2: the 56th.
+    assert stands == [0.0] * 55 + [1.0] * 15
+    assert phases[54] == pytest.approx(0.12 + 15 * 0.02 / 0.8, abs=1e-5)
+    assert phases[55:] == [0.5] * 15
     commands.override(*walk)
     commands.step(rng)
     assert float(commands.current().stand) == 0.0

@@ -62,24 +62,39 @@ def test_phases_begin_at_random_or_at_rest(rng):
 
 
 def test_it_comes_to_rest_with_both_feet_down_by_hand():
-    """From 0.12, at 0.025 a step: 0.38 to go are 15.2 steps, so the sixteenth ends at 0.5 and stays."""
+    """From 0.12, at 0.025 a step: a stride is 40 steps; then 0.38 to go are 15.2 steps, so the 56th ends at 0.5."""
     g = gait(1)
     g.phase = torch.tensor([0.12])
     phases, stands = [], []
-    for _ in range(20):
+    for _ in range(60):
         g.step(torch.tensor([True]))
         phases.append(float(g.phase))
         stands.append(float(g.stand))
-    assert stands == [0.0] * 15 + [1.0] * 5
-    assert phases[14] == pytest.approx(0.12 + 15 * 0.025)
-    assert phases[15:] == [0.5] * 5
+    assert stands == [0.0] * 55 + [1.0] * 5
+    assert phases[54] == pytest.approx(0.12 + 15 * 0.025, abs=1e-5)
+    assert phases[55:] == [0.5] * 5
+
+
+def test_a_stride_begins_anew_where_standing_is_no_longer_asked_for():
+    g = gait(1)
+    g.phase = torch.tensor([0.12])
+    for asked in (*[True] * 39, False, *[True] * 40):
+        g.step(torch.tensor([asked]))
+        assert float(g.stand) == 0.0
+    for _ in range(15):
+        g.step(torch.tensor([True]))
+    assert float(g.stand) == 0.0  # 95 steps from 0.12 are 2.495 strides, and the next one ends at 2.5
+    g.step(torch.tensor([True]))
+    assert (float(g.phase), float(g.stand)) == (0.5, 1.0)
 
 
 def test_it_comes_to_rest_at_the_end_of_a_stride_too():
     g = gait(1)
     g.phase = torch.tensor([0.97])
-    for _ in range(2):
+    for _ in range(41):
         g.step(torch.tensor([True]))
+    assert float(g.stand) == 0.0
+    g.step(torch.tensor([True]))
     assert (float(g.phase), float(g.stand)) == (0.0, 1.0)
 
 
@@ -90,12 +105,13 @@ def test_it_goes_on_from_where_it_rested(rest):
     g.step(torch.tensor([False, True]))
     assert g.phase.tolist() == pytest.approx([rest + 0.025, rest])
     assert g.stand.tolist() == [0.0, 1.0]
-    # Asked to stand again at once: half a stride on, not where it has just left.
-    for _ in range(19):
+    # Asked to stand again at once: a stride, and on to where both feet are down.
+    for _ in range(58):
         g.step(torch.tensor([True, True]))
-        assert float(g.stand[0]) == 0.0 or float(g.phase[0]) == (rest + 0.5) % 1.0
+        assert float(g.stand[0]) == 0.0
     g.step(torch.tensor([True, True]))
     assert g.phase.tolist() == [(rest + 0.5) % 1.0, rest]
+    assert g.stand.tolist() == [1.0, 1.0]
 
 
 def test_reset_touches_only_its_envs(rng):

@@ -63,7 +63,7 @@ def default() -> BaseTraining:
             assist=AssistConfig(enabled=True),
             forces=ExternalForceConfig(
                 hand_loads=HandLoadConfig(enabled=True, ramp=RampConfig(16e6, 60e6, first=0.1)),
-                pushes=PushConfig(enabled=True, velocity=(0.0, 1.2), ramp=RampConfig(20e6, 80e6)),
+                pushes=PushConfig(enabled=True, velocity=(0.0, 1.2), ramp=RampConfig(20e6, 80e6, first=0.3)),
             ),
         ),
         runner=RunnerConfig(iterations=12_207),
