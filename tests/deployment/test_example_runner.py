@@ -26,7 +26,7 @@ ENGINE = EngineConfig(timestep=0.01, collision="feet")
 ASKED = {
     0: TimedCommand(velocity=(0.6, -0.2), yaw_rate=0.5),
     45: TimedCommand(stand=True, height_offset=-0.1),
-    85: TimedCommand(velocity=(-0.3, 0.0)),
+    135: TimedCommand(velocity=(-0.3, 0.0)),
 }
 """Commands, by the step from which they hold."""
 
@@ -58,7 +58,7 @@ def test_the_runner_is_the_packages_loop(robot, upper_mode, random_policy, examp
     machine.start(pose, seed=0)
     machine.engine.hold(True)
     moved, rested = 0.0, False
-    for k in range(100):
+    for k in range(150):
         if k in ASKED:
             asked = ASKED[k]
             give(controller, asked)

@@ -121,7 +121,7 @@ def side_by_side(checkpoint, exported, laws: UpperBodyConfig) -> tuple[HumanoidE
         for name, here, there in by_term(env, obs["policy"][0].numpy(), policy.observed):
             nearly = 3e-5 if name == "arm_torque" else 1e-5  # torques are of some 10 Nm, in single precision
             np.testing.assert_allclose(there, here, 1e-5, nearly, err_msg=f"step {k}, {name}")
-        if k == 50:
+        if k == 10:
             for commands in (env.commands, controller.commands):
                 command(commands, False, nominal - 0.1)
         obs, _, dones, _ = env.step(in_torch(as_dict(obs)))
