@@ -29,9 +29,9 @@ def test_targets_by_hand_for_the_h1(spec):
     action[0, 3], action[0, 10], action[0, 11], action[1, 18] = 2.0, 4.0, -3.0, 1.0
     reference = torch.linspace(0.1, 0.8, 8).repeat(2, 1)
     target = JointTargets(ActionConfig(), spec)(action, reference)
-    assert float(target[0, 3]) == pytest.approx(0.45 + 0.25 * 2.0)  # knee: default plus scaled action
+    assert float(target[0, 3]) == pytest.approx(0.45 + 0.6 * 2.0)  # knee: default plus scaled action
     assert float(target[0, 2]) == pytest.approx(-0.13)
-    assert float(target[0, 10]) == pytest.approx(0.25 * 200.0 / 300.0 * 4.0)  # torso: 200 Nm at 300 Nm/rad
+    assert float(target[0, 10]) == pytest.approx(0.6 * 200.0 / 300.0 * 4.0)  # torso: 200 Nm at 300 Nm/rad
     assert float(target[0, 11]) == pytest.approx(0.1 - 0.1 * 3.0)  # shoulder: reference plus scaled residual
     assert float(target[1, 18]) == pytest.approx(0.8 + 0.1)
     absolute = JointTargets(ActionConfig(upper_mode="absolute"), spec)(action, reference)

@@ -330,7 +330,7 @@ def test_the_layout_names_what_a_policy_must_agree_with(make_env, any_spec):
     assert layout["joints"] == list(any_spec.joint_names)
     assert layout["history"] == 5
     assert layout["control_dt"] == 0.02
-    assert layout["actions"]["lower_scale"] == 0.25
+    assert layout["actions"]["lower_scale"] == 0.6
     assert [name for name, _, _ in layout["terms"]][:2] == ["torso_angular_velocity", "projected_gravity"]
 
 

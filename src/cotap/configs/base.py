@@ -86,7 +86,7 @@ def paper() -> BaseTraining:
     return BaseTraining(
         env=HumanoidEnvConfig(
             num_envs=4096,
-            actions=ActionConfig(upper_scale=0.25, upper_mode="absolute"),
+            actions=ActionConfig(lower_scale=0.25, upper_scale=0.25, upper_mode="absolute"),
             observations=ObservationConfig(critic="history"),
             commands=CommandConfig(
                 velocity_x=(-1.0, 1.0), velocity_y=(-1.0, 1.0), yaw_rate=(-1.0, 1.0), stand_probability=0.4,

@@ -16,7 +16,7 @@ UPPER_MODES = ("residual", "absolute")
 class ActionConfig:
     """How actions become joint targets."""
 
-    lower_scale: float = 0.25
+    lower_scale: float = 0.6
     """Radians per unit of lower action, added to the default pose. A joint whose stiffness reaches its torque limit
     before a radian has that share of it: exploration shakes no waist harder than a leg."""
     upper_scale: float = 0.1
