@@ -85,7 +85,7 @@ def test_metadata_is_what_a_robot_needs(robot, random_checkpoint, random_policy)
     for name, field in (("kp", "kp"), ("kd", "kd"), ("torque_limit_nm", "torque_limit_nm"),
                         ("default_pose_rad", "default_rad")):  # fmt: skip
         assert getattr(m, name) == [getattr(j, field) for j in spec.joints]
-    legs = [0.25 * min(1.0, joint.torque_limit_nm / joint.kp) for joint in spec.joints[:lower]]
+    legs = [0.6 * min(1.0, joint.torque_limit_nm / joint.kp) for joint in spec.joints[:lower]]
     scale = np.array(legs + [0.1] * (joints - lower), dtype=np.float32)
     np.testing.assert_allclose(m.action["scale_rad"], scale, rtol=0, atol=5e-10)  # nine decimals
     assert (m.action["clip"], m.action["upper_mode"]) == (20.0, "residual")
