@@ -59,7 +59,7 @@ class PolicyRunner:
         self.velocity_rate = self.dt * np.array(
             [rates["acceleration"], rates["acceleration"], rates["yaw_acceleration"]], np.float32
         )
-        self.phase, self.stand, self.asked = np.float32(phase), True, np.float32(0.0)
+        self.phase, self.stand, self.on_the_spot = np.float32(phase), True, np.float32(0.0)
         (num_arms,) = (width for name, width, _ in meta["observation"]["terms"] if name == "reference_arm_position")
         self.reference = self.default[-num_arms:] if arm_reference is None else np.array(arm_reference)
         self.action = np.zeros(len(self.default))
@@ -85,8 +85,8 @@ class PolicyRunner:
         return sent
 
     def follow(self, command: Command) -> None:
-        """Let the command approach what is asked for, and the gait go on; it rests with both feet down, a stride
-        after it was asked to."""
+        """Let the command approach what is asked for, and the gait go on; it rests with both feet down, after
+        a stride on the spot."""
         asked = np.array([*command.velocity, command.yaw_rate], np.float32)
         self.velocity = self.velocity + np.clip(asked - self.velocity, -self.velocity_rate, self.velocity_rate)
         nominal = self.meta["nominal_height_m"]
@@ -96,12 +96,12 @@ class PolicyRunner:
         to_stand = command.stand and not self.velocity.any()
         if self.stand and to_stand:
             return
-        stride = np.float32(self.dt / self.meta["gait"]["period_s"])
-        self.asked = self.asked + stride if to_stand else np.float32(0.0)
-        half_strides = 2.0 * (self.phase + stride)
+        share = np.float32(self.dt / self.meta["gait"]["period_s"])  # of a stride
+        self.on_the_spot = self.on_the_spot + share if to_stand else np.float32(0.0)
+        half_strides = 2.0 * (self.phase + share)
         landed = np.floor(half_strides + 1e-4)
         both_down = landed > np.floor(2.0 * self.phase + 1e-4)
-        self.stand = bool(to_stand and both_down and self.asked > 1.0 - 1e-4)
+        self.stand = bool(to_stand and both_down and self.on_the_spot > 1.0 - 1e-4)
         self.phase = (0.5 * (landed if self.stand else half_strides)) % np.float32(1.0)
 
     def observe(self, s: Sensors) -> dict[str, np.ndarray]:

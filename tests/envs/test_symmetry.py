@@ -9,6 +9,7 @@ import torch
 from env_tools import NOISY, NOMINAL, privileged, zeros
 
 from cotap.compliance.laws import LawConfig
+from cotap.envs.actions import ActionConfig
 from cotap.envs.config import RewardConfig
 from cotap.envs.external_forces import ExternalForceConfig
 from cotap.envs.hand_loads import HandLoadConfig
@@ -62,7 +63,8 @@ def test_reflections_fit_and_undo_themselves(make_env, robot, rng, observations,
 
 def mirrored_pair(make_env, robot: str, **fields):
     """Two envs that start as mirror images; the H1's own left and right differ in the seventh digit."""
-    env = make_env(2, robot=robot, randomization=NOMINAL, **fields)
+    small = ActionConfig(lower_scale=0.25)  # what differs between left and right grows with the movement
+    env = make_env(2, robot=robot, randomization=NOMINAL, actions=small, **fields)
     joints, lower = len(env.spec.joints), env.num_lower
     reflect = joint_reflection(env.spec, env.spec.joint_names)
     sign = torch.tensor([1.0, -1.0])
@@ -92,7 +94,7 @@ def mirrored_steps(env, steps: int):
     """Observations and each group's reward of every step, driven by mirrored actions."""
     rng = torch.Generator().manual_seed(0)
     for _ in range(steps):
-        action = 0.12 * torch.randn(env.num_actions, generator=rng)  # 0.07 rad at the legs
+        action = 0.3 * torch.randn(env.num_actions, generator=rng)
         obs, _, done, extras = env.step(torch.stack((action, env.symmetry.actions(action))))
         assert not done.any()
         yield obs, extras

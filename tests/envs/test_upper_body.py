@@ -77,15 +77,10 @@ def test_pd_as_a_law_is_pd_through_the_actuators(make_env):
 
 def test_pd_beside_a_law_is_pd_with_gains_of_each_joint(make_env, robot):
     """One arm under a law makes the other's PD a law too, with its own gains: it moves as under the actuators."""
+    small = ActionConfig(lower_scale=0.25)  # legs that swing far shake the arms
+    fields = {"robot": robot, "randomization": NOMINAL, "fixed_base": True, "actions": small}
     plain, mixed = (
-        make_env(
-            2,
-            robot=robot,
-            randomization=NOMINAL,
-            fixed_base=True,
-            upper_body=UpperBodyConfig(right=right),
-            actions=ActionConfig(lower_scale=0.25),
-        )  # legs that swing far shake the arms
+        make_env(2, upper_body=UpperBodyConfig(right=right), **fields)
         for right in (LawConfig("pd"), LawConfig("soft-pd"))
     )
     drive(plain, 10)

@@ -31,17 +31,17 @@ class GaitPhase(Stateful):
     """Phase (N,) in [0, 1) and whether it rests, `stand` (N,) 1 or 0. It comes to rest with both feet down, at 0 or
     0.5, once standing has been asked for during a stride: a robot that stops loses its speed with its last steps."""
 
-    STATE = ("phase", "stand", "_asked")
+    STATE = ("phase", "stand", "_on_the_spot")
 
     def __init__(self, cfg: GaitConfig, num_envs: int, dt: float) -> None:
         cfg.check()
         self._rate = dt / cfg.period_s
         self.phase, self.stand = torch.zeros(num_envs), torch.zeros(num_envs)
-        self._asked = torch.zeros(num_envs)  # strides through which standing has been asked for
+        self._on_the_spot = torch.zeros(num_envs)  # strides since standing was asked for
 
     def reset(self, mask: torch.Tensor, stand: torch.Tensor, rng: torch.Generator) -> None:
         """Begin at rest where `stand` (n,) is 1, else at a random phase, so that envs are not in step."""
-        self.stand[mask], self._asked[mask] = stand, 0.0
+        self.stand[mask], self._on_the_spot[mask] = stand, 0.0
         start = torch.rand(len(stand), generator=rng, device=rng.device)
         self.phase[mask] = torch.where(stand > 0.5, 0.5 * (start < 0.5), start)
 
@@ -50,9 +50,9 @@ class GaitPhase(Stateful):
         half_strides = 2.0 * (self.phase + self._rate)
         landed = (half_strides + _ROUNDING).floor()
         both_down = landed > (2.0 * self.phase + _ROUNDING).floor()
-        self._asked = (self._asked + self._rate) * to_stand
+        self._on_the_spot = (self._on_the_spot + self._rate) * to_stand
         stays = (self.stand > 0.5) & to_stand
-        stops = ~stays & to_stand & both_down & (self._asked > 1.0 - _ROUNDING)
+        stops = ~stays & to_stand & both_down & (self._on_the_spot > 1.0 - _ROUNDING)
         running = 0.5 * torch.where(stops, landed, half_strides)
         self.phase = torch.where(stays, self.phase, running.remainder(1.0))
         self.stand = (stays | stops).float()
