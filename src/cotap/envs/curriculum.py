@@ -82,10 +82,10 @@ class Curriculum:
 class AssistConfig:
     """A wrench on the torso that carries the robot through its first, slow steps and fades, ever more slowly.
 
-    Without it, robots learn to walk, but for long hardly to turn and to squat; with slow commands and no wrench, they
-    learn to stand still. Gains are in units of the robot's weight, so that they fit any robot; damping is no more than
-    the torso's inertia bears. It lifts a constant share of the weight: a lift that grew as the robot sank would teach
-    it to hang.
+    Without it, the H1 learned to walk, but hardly to turn and to squat in as many samples; with slow commands and no
+    wrench, it learned to stand still. Gains are in units of the robot's weight, so that they fit any robot; damping is
+    no more than the torso's inertia bears. It lifts a constant share of the weight: a lift that grew as the robot sank
+    would teach it to hang.
     """
 
     enabled: bool = False

@@ -37,7 +37,7 @@ class GaitPhase(Stateful):
         cfg.check()
         self._rate = dt / cfg.period_s
         self.phase, self.stand = torch.zeros(num_envs), torch.zeros(num_envs)
-        self._on_the_spot = torch.zeros(num_envs)  # strides since standing was asked for
+        self._on_the_spot = torch.zeros(num_envs)  # strides walked there
 
     def reset(self, mask: torch.Tensor, stand: torch.Tensor, rng: torch.Generator) -> None:
         """Begin at rest where `stand` (n,) is 1, else at a random phase, so that envs are not in step."""
