@@ -50,23 +50,6 @@ def test_assistance_fades_as_a_square_to_nothing(samples, share):
     assert AssistConfig(enabled=False, full_samples=100, end_samples=300).share(samples) == 0.0
 
 
-@pytest.mark.parametrize(("samples", "share"), [(0, 0.3), (100, 0.3), (200, 0.825), (300, 1.0), (400, 1.0)])
-def test_velocities_grow_as_assistance_fades(samples, share):
-    cfg = AssistConfig(enabled=True, full_samples=100, end_samples=300, first_velocities=0.3)
-    assert cfg.velocities(samples) == pytest.approx(share)  # half way a quarter of the assistance is left
-    assert AssistConfig(enabled=False, first_velocities=0.3).velocities(samples) == 1.0
-
-
-def test_commands_are_slow_while_robots_are_assisted(make_env, robot):
-    envs = [make_env(512, robot=robot, assist=AssistConfig(enabled, first_velocities=0.3)) for enabled in (True, False)]
-    slow, fast = (env.commands.asked_velocity.abs().amax(0) for env in envs)
-    torch.testing.assert_close(slow, 0.3 * fast)
-    envs[0].samples = 10**9
-    envs[0].commands._remaining_s.zero_()
-    envs[0].step(zeros(envs[0]))
-    assert (envs[0].commands.asked_velocity.abs().amax(0) > 2.0 * slow).all()
-
-
 def test_a_curriculum_counts_samples_while_few_fall():
     """By hand, at steps of 1 s: the average over 10 s of falls moves by a tenth of the way."""
     curriculum = Curriculum(CurriculumConfig(max_falls_per_s=0.02), dt=1.0)
@@ -130,7 +113,6 @@ def test_assistance_may_end_all_at_once():
         (AssistConfig(full_samples=9.0, end_samples=5.0), "assist.end_samples"),
         (AssistConfig(velocity_gain=math.nan), "assist.velocity_gain"),
         (AssistConfig(weight_share=1.5), "assist.weight_share"),
-        (AssistConfig(first_velocities=-0.1), "assist.first_velocities"),
     ],
 )
 def test_bad_fields_are_named(cfg, match):

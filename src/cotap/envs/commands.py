@@ -88,8 +88,6 @@ class CommandSource(Stateful):
         self._remaining_s = torch.zeros(num_envs)
         self.gait = GaitPhase(gait, num_envs, dt)
         self.resample = True
-        self.velocity_share = 1.0
-        """Share of the velocities' ranges that is drawn from."""
 
     @property
     def asked_to_stand(self) -> torch.Tensor:
@@ -164,8 +162,7 @@ class CommandSource(Stateful):
         velocity = torch.stack(
             [uniform(rng, *bounds, n) for bounds in (cfg.velocity_x, cfg.velocity_y, cfg.yaw_rate)], 1
         )
-        moves = torch.rand(n, 3, generator=rng, device=rng.device) >= cfg.axis_zero_probability
-        velocity = self.velocity_share * velocity * moves
+        velocity *= torch.rand(n, 3, generator=rng, device=rng.device) >= cfg.axis_zero_probability
         stand = (torch.rand(n, generator=rng, device=rng.device) < cfg.stand_probability).float()
         offset = stand * uniform(rng, *cfg.height_offset, n)
         self._target[mask] = torch.cat(

@@ -80,12 +80,12 @@ class Curriculum:
 
 @dataclass
 class AssistConfig:
-    """A wrench on the torso that carries the robot through its first, slow steps and fades, ever more slowly.
+    """A wrench on the torso that carries the robot through its first steps and fades, ever more slowly.
 
-    Without it, the H1 learned to walk, but hardly to turn and to squat in as many samples; with slow commands and no
-    wrench, it learned to stand still. Gains are in units of the robot's weight, so that they fit any robot; damping is
-    no more than the torso's inertia bears. It lifts a constant share of the weight: a lift that grew as the robot sank
-    would teach it to hang.
+    Without it, the H1 learned to walk, but hardly to turn and to squat in as many samples. Commands are at full speed
+    from the start: where the wrench carried slow ones, the H1 learned to stand, and not to step when pushed. Gains are
+    in units of the robot's weight, so that they fit any robot; damping is no more than the torso's inertia bears. It
+    lifts a constant share of the weight: a lift that grew as the robot sank would teach it to hang.
     """
 
     enabled: bool = False
@@ -106,16 +106,12 @@ class AssistConfig:
     """Largest pull, over weight."""
     weight_share: float = 0.25
     """Share of the weight that is lifted."""
-    first_velocities: float = 0.3
-    """Share of the velocity commands' ranges at full assistance; it grows to all of them as the assistance fades. A
-    small robot that is pulled along fast learns to rock before it learns to step."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
         require_range("assist.full_samples", self.full_samples, 0.0, 1e15)
         require_range("assist.end_samples", self.end_samples, self.full_samples, 1e15)
-        for name in ("weight_share", "first_velocities"):
-            require_range(f"assist.{name}", getattr(self, name), 0.0, 1.0)
+        require_range("assist.weight_share", self.weight_share, 0.0, 1.0)
         for name in ("upright_stiffness", "upright_damping", "yaw_gain", "velocity_gain", "force_limit"):
             require_range(f"assist.{name}", getattr(self, name), 0.0, 100.0)
 
@@ -124,10 +120,6 @@ class AssistConfig:
         if not self.enabled or samples >= self.end_samples:
             return 0.0
         return min(1.0, (self.end_samples - samples) / max(self.end_samples - self.full_samples, 1.0)) ** 2
-
-    def velocities(self, samples: float) -> float:
-        """Share of the velocity commands' ranges after so many samples."""
-        return 1.0 - (1.0 - self.first_velocities) * self.share(samples)
 
 
 _DAMPING_SHARE = 1.5

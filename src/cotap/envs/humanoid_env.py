@@ -107,7 +107,6 @@ class HumanoidEnv(VecEnv):
         self._assist = AssistWrench(cfg.assist, spec, torch.as_tensor(torso_inertia(spec, model)), dt)
         self._torso = model.body(spec.torso_body).id
         self.curriculum = Curriculum(cfg.curriculum, dt)
-        self.commands.velocity_share = cfg.assist.velocities(0)
         self._min_height_m = cfg.terminations.min_height_m(spec)
         self.samples = self.num_diverged = 0
         self.keeps_final_observation = False
@@ -221,7 +220,6 @@ class HumanoidEnv(VecEnv):
     def _advance(self) -> None:
         """Let commands, laws and forces go on by one control step."""
         s = self.state
-        self.commands.velocity_share = self.cfg.assist.velocities(self.samples)
         self.commands.step(self.rng)
         if self.cfg.path.share > 0.0:
             velocity, yaw_rate = self.path.step(s.torso_pos_w[:, :2], s.heading_w, self.motions.root_velocity())
