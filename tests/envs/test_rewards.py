@@ -191,11 +191,11 @@ CASES = [
     ("contact_schedule", {"foot_force": [[250.0, 4.9]]}, 0.5),
     ("contact_schedule", {"desired_contact": [[False, False]]}, 0.0),
     ("contact_schedule", {"foot_force": [[250.0, 0.0]], "desired_contact": [[True, False]]}, 1.0),
-    # Left foot in mid-swing should be 0.1 m up: it is on the floor, right, halfway, and higher than it need be.
+    # Left foot in mid-swing should be 0.1 m up: it is on the floor, right, halfway, and too high.
     ("swing_height", LEFT_LIFTED, 0.1),
     ("swing_height", {**LEFT_LIFTED, "foot_pos_w": [[[3.0, -1.9, 0.1], [3.0, -2.1, 0.5]]]}, 0.0),
     ("swing_height", {**LEFT_LIFTED, "foot_pos_w": [[[3.0, -1.9, 0.05], [3.0, -2.1, 0.0]]]}, 0.05),
-    ("swing_height", {**LEFT_LIFTED, "foot_pos_w": [[[3.0, -1.9, 0.15], [3.0, -2.1, 0.0]]]}, 0.0),
+    ("swing_height", {**LEFT_LIFTED, "foot_pos_w": [[[3.0, -1.9, 0.15], [3.0, -2.1, 0.0]]]}, 0.05),
     # A quarter through the swing it should be half as high.
     ("swing_height", {"desired_contact": [[False, True]], "swing": [[0.25, 0.0]]}, 0.05),
     ("foot_slip", {"foot_velocity_w": [[[0.3, 0.4, 9.0], [0.0, -0.1, 0.0]]]}, 0.6),

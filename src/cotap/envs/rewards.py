@@ -151,8 +151,8 @@ def _hand_offset(s: StepRecord) -> torch.Tensor:
     return (s.key_points_t - s.key_points_reference_t)[:, : s.hand_push_w.shape[1]]
 
 
-def swing_clearance(swing: torch.Tensor, peak_m: float) -> torch.Tensor:
-    """Height that a sole should have at least at `swing` progress: a smooth bump of height `peak_m` [m]."""
+def _sole_height(swing: torch.Tensor, peak_m: float) -> torch.Tensor:
+    """Height that a sole should have at `swing` progress: a smooth bump of height `peak_m` [m]."""
     return peak_m * torch.sin(torch.pi * swing).square()
 
 
@@ -232,9 +232,10 @@ class LowerRewards:
 
     @term(-60.0)
     def swing_height(s: StepRecord) -> torch.Tensor:
-        """Height that the swinging soles lack [m]; linear: the first centimetre is worth as much as the last."""
-        missing = swing_clearance(s.swing, s.scales.foot_clearance_m) - s.state.foot_pos_w[:, :, 2]
-        return (missing.clamp_min(0.0) * ~s.desired_contact).sum(1)
+        """How far the swinging soles are from their height [m]; linear: the first centimetre is worth as much as the
+        last."""
+        off = _sole_height(s.swing, s.scales.foot_clearance_m) - s.state.foot_pos_w[:, :, 2]
+        return (off.abs() * ~s.desired_contact).sum(1)
 
     @term(-5.0)
     def foot_slip(s: StepRecord) -> torch.Tensor:
