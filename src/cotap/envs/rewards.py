@@ -232,8 +232,8 @@ class LowerRewards:
 
     @term(-60.0)
     def swing_height(s: StepRecord) -> torch.Tensor:
-        """How far the swinging soles are from their height [m]; linear: the first centimetre is worth as much as the
-        last."""
+        """How far the swinging soles are above or below the height that they should have [m]; linear: the first
+        centimetre is worth as much as the last."""
         off = _sole_height(s.swing, s.scales.foot_clearance_m) - s.state.foot_pos_w[:, :, 2]
         return (off.abs() * ~s.desired_contact).sum(1)
 
