@@ -80,9 +80,10 @@ def test_root_velocity_of_a_circle_by_hand():
     torch.testing.assert_close(v[:, 2], torch.full((200,), 0.5), atol=1e-3, rtol=0)
 
 
-def play(cfg: ReferenceConfig, spec, num_envs=64, seconds=20.0, seed=0):
+def play(cfg: ReferenceConfig, spec, num_envs=64, seconds=20.0, seed=0, part=1.0):
     rng = torch.Generator().manual_seed(seed)
     motion = ReferenceMotion(cfg, spec, num_envs, DT)
+    motion.share = part
     motion.reset(everyone(num_envs), rng)
     positions, velocities, clips = [motion.current().position], [], []
     for _ in range(round(seconds / DT)):
@@ -116,6 +117,19 @@ def test_the_reference_keeps_to_position_and_velocity_limits(any_spec, share, tm
     assert (step.abs() <= speed * DT + 1e-5).all()
     torch.testing.assert_close(step / DT, velocities, atol=1e-3, rtol=0)
     assert float(clips.float().mean()) == pytest.approx(share, abs=0.06)
+
+
+@pytest.mark.parametrize("part", [0.0, 0.3])
+@pytest.mark.parametrize("clips", [0.0, 1.0])
+def test_a_part_of_the_motion_is_asked_for(any_spec, tmp_path, part, clips):
+    """Of the same motion, drawn alike; clips that never change, as transitions have a duration of their own."""
+    path = tmp_path / "own.npz"
+    MotionLibrary([swaying(any_spec, "a", 0.0)], any_spec).save(path)
+    cfg = ReferenceConfig(clips=ClipConfig(share=clips, hold_s=(60.0, 60.0), library=str(path)))
+    whole, less = (play(cfg, any_spec, 8, 2.0, part=p) for p in (1.0, part))
+    default = torch.tensor([any_spec.joints[i].default_rad for i in any_spec.indices(any_spec.upper_joints)])
+    torch.testing.assert_close(less[0], default + part * (whole[0] - default), atol=1e-5, rtol=0)
+    torch.testing.assert_close(less[1], part * whole[1], atol=1e-3, rtol=0)
 
 
 def test_transitions_are_slow_and_end_where_they_should(spec, tmp_path):

@@ -143,6 +143,8 @@ class ReferenceMotion(Stateful):
         self._velocity = torch.zeros(n, len(joints))
         self._fixed = False
         self._led: str | None = None
+        self.share = 1.0
+        """Share of the way from the default pose to motion that arms are asked to go; poses that are held aside."""
 
     def lead(self, motion: str) -> None:
         """Take all envs from where their arms are, held or not, into `motion`, until further notice: a clip's name,
@@ -233,18 +235,19 @@ class ReferenceMotion(Stateful):
             self.clips.start(mask, self.clips.names.index(motion))
 
     def _raw(self) -> ArmReference:
-        """What generator or clip ask for, transitions aside."""
-        generated = self.generator.current()
+        """What generator or clip ask for, or the share of it, transitions aside."""
+        motion = self.generator.current()
         if self._led == REST:
-            return ArmReference(self.default.expand_as(generated.position), torch.zeros_like(generated.velocity))
-        if self.clips is None:
-            return generated
-        chosen = self._from_clip.unsqueeze(1)
-        still = torch.zeros_like(generated.velocity)
-        return ArmReference(
-            torch.where(chosen, self.clips.current(), generated.position),
-            torch.where(chosen, still, generated.velocity),
-        )
+            return ArmReference(self.default.expand_as(motion.position), torch.zeros_like(motion.velocity))
+        if self.clips is not None:
+            chosen = self._from_clip.unsqueeze(1)
+            motion = ArmReference(
+                torch.where(chosen, self.clips.current(), motion.position),
+                motion.velocity.masked_fill(chosen, 0.0),
+            )
+        if self.share == 1.0:
+            return motion
+        return ArmReference(self.default.lerp(motion.position, self.share), self.share * motion.velocity)
 
     def _advance(self, rng: torch.Generator) -> torch.Tensor:
         """Advance generator and clips, change motions that are due, and return the raw positions (N, U)."""
