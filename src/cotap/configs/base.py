@@ -16,7 +16,7 @@ from cotap.checks import reason_of, require_range
 from cotap.envs.actions import ActionConfig
 from cotap.envs.commands import CommandConfig
 from cotap.envs.config import HumanoidEnvConfig
-from cotap.envs.curriculum import AssistConfig, RampConfig
+from cotap.envs.curriculum import AssistConfig, CurriculumConfig, RampConfig
 from cotap.envs.external_forces import ExternalForceConfig
 from cotap.envs.gait_phase import GaitConfig
 from cotap.envs.hand_loads import HandLoadConfig
@@ -61,6 +61,7 @@ def default() -> BaseTraining:
         env=HumanoidEnvConfig(
             num_envs=1024,
             assist=AssistConfig(enabled=True),
+            curriculum=CurriculumConfig(arm_motion=RampConfig(16e6, 60e6, first=0.1)),
             forces=ExternalForceConfig(
                 hand_loads=HandLoadConfig(enabled=True, ramp=RampConfig(16e6, 60e6, first=0.1)),
                 pushes=PushConfig(enabled=True, velocity=(0.0, 1.2), ramp=RampConfig(20e6, 80e6, first=0.3)),
@@ -73,7 +74,11 @@ def default() -> BaseTraining:
 def quick() -> BaseTraining:
     """Walking in the shortest time: no pushes, no loads; 30 M samples."""
     return BaseTraining(
-        env=HumanoidEnvConfig(num_envs=1024, assist=AssistConfig(enabled=True)),
+        env=HumanoidEnvConfig(
+            num_envs=1024,
+            assist=AssistConfig(enabled=True),
+            curriculum=CurriculumConfig(arm_motion=RampConfig(12e6, 24e6, first=0.1)),
+        ),
         runner=RunnerConfig(iterations=1220),
     )
 
@@ -94,6 +99,7 @@ def paper() -> BaseTraining:
             ),
             gait=GaitConfig(period_s=1.0),
             assist=AssistConfig(enabled=True),
+            curriculum=CurriculumConfig(arm_motion=RampConfig(16e6, 60e6, first=0.1)),
             forces=ExternalForceConfig(
                 hand_loads=HandLoadConfig(
                     enabled=True, episode_share=1.0, torque_share=1.0, ramp=RampConfig(20e6, 100e6, first=0.1)
