@@ -1,9 +1,8 @@
-"""What changes as training goes on, by samples: the arms' motion and disturbances grow, and the wrench that assists
-first steps fades."""
+"""What changes as training goes on, by samples: disturbances grow, and the wrench that assists first steps fades."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 
@@ -45,18 +44,15 @@ class RampConfig:
 
 @dataclass
 class CurriculumConfig:
-    """When the arms' motion and disturbances grow with the samples, and when they wait. The assistance does not wait:
-    robots that keep it lean on it."""
+    """When disturbances grow with the samples, and when they wait. The assistance does not wait: robots that keep it
+    lean on it."""
 
     max_falls_per_s: float = 0.02
-    """Falls per second and env above which nothing grows."""
-    arm_motion: RampConfig = field(default_factory=RampConfig)
-    """Share of the way from the default pose to the motion that is drawn for the arms."""
+    """Falls per second and env above which no disturbance grows."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
         require_range("curriculum.max_falls_per_s", self.max_falls_per_s, 0.0, 1e3)
-        self.arm_motion.check("curriculum.arm_motion")
 
 
 class Curriculum:
@@ -66,11 +62,6 @@ class Curriculum:
         self._cfg, self._dt = cfg, dt
         self._share = min(dt / _FALLS_OVER_S, 1.0)
         self.samples, self.falls_per_s = 0, 0.0
-
-    @property
-    def arm_share(self) -> float:
-        """Share of the arms' motion now."""
-        return self._cfg.arm_motion.share(self.samples)
 
     def step(self, fell: torch.Tensor, samples: int) -> None:
         """Count the `samples` of a step in which the envs of `fell` (N,) have fallen."""

@@ -107,7 +107,6 @@ class HumanoidEnv(VecEnv):
         self._assist = AssistWrench(cfg.assist, spec, torch.as_tensor(torso_inertia(spec, model)), dt)
         self._torso = model.body(spec.torso_body).id
         self.curriculum = Curriculum(cfg.curriculum, dt)
-        self.motions.share = self.curriculum.arm_share
         self._min_height_m = cfg.terminations.min_height_m(spec)
         self.samples = self.num_diverged = 0
         self.keeps_final_observation = False
@@ -208,7 +207,6 @@ class HumanoidEnv(VecEnv):
 
     def _act(self, action: torch.Tensor) -> None:
         """Send targets and set forces. The reference moves first: arms are sent where it will be at the step's end."""
-        self.motions.share = self.curriculum.arm_share
         self.motions.step(self.rng)
         reference = self.motions.current()
         joints, laws = action.tensor_split((self._num_joints,), 1)
