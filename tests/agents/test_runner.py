@@ -177,14 +177,14 @@ def test_samples_go_on_in_fresh_envs_and_with_them_the_curricula(tmp_path: Path)
     env = robots()
     runner = make_runner(tmp_path, 1, env=env)
     env.samples = 7_000_000
-    env.curriculum.samples, env.curriculum.falls_per_s = 5_000_000, 0.01
+    env.curriculum.samples, env.curriculum.falls_per_s, env.curriculum.arm_motion = 5_000_000, 0.01, 0.5
     runner.runner_cfg.save_envs = False
     runner.save()
     assert load_checkpoint(checkpoint(tmp_path, 0))["env"] == {}
     other = robots(3)
     make_runner(tmp_path / "b", 1, env=other).load(str(checkpoint(tmp_path, 0)))
     assert other.samples == 7_000_000
-    assert other.curriculum.state_dict() == {"samples": 5_000_000, "falls_per_s": 0.01}
+    assert other.curriculum.state_dict() == {"samples": 5_000_000, "falls_per_s": 0.01, "arm_motion": 0.5}
 
 
 def test_a_checkpoint_of_weights_alone_does_not_go_on(tmp_path: Path):

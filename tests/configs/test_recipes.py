@@ -201,7 +201,7 @@ def test_a_distillation_begins_with_what_its_base_ended_with():
     assert not env.assist.enabled
     assert env.forces.pushes.enabled
     assert env.forces.pushes.ramp.share(0.0) == env.forces.hand_loads.ramp.share(0.0) == 1.0
-    assert env.motions.amplitude == (1.0, 1.0)
+    assert env.curriculum.arm_motion_samples == 0.0
     assert training.ppo.initial_std == training.ppo.least_std
 
 

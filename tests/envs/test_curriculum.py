@@ -55,7 +55,7 @@ def test_a_curriculum_counts_samples_while_few_fall():
     curriculum = Curriculum(CurriculumConfig(max_falls_per_s=0.02), dt=1.0)
     nobody, one = torch.zeros(4, dtype=torch.bool), torch.tensor([False, True, False, False])
     curriculum.step(nobody, 100)
-    assert curriculum.state_dict() == {"samples": 100, "falls_per_s": 0.0}
+    assert curriculum.state_dict() == {"samples": 100, "falls_per_s": 0.0, "arm_motion": 1.0}
     curriculum.step(one, 100)  # a quarter fell: 0.1 * 0.25 = 0.025
     assert curriculum.falls_per_s == pytest.approx(0.025)
     assert curriculum.samples == 100
@@ -89,17 +89,59 @@ def test_pushes_do_not_grow_while_many_fall(make_env, robot):
     assert extras["log"]["/curriculum/samples"].item() == 0.0
 
 
+def test_arms_move_less_while_many_fall():
+    """By 100 of 400 samples a step; between half of the limit and the limit they stay as they are."""
+    curriculum = Curriculum(CurriculumConfig(max_falls_per_s=0.02, arm_motion_samples=400), dt=1.0)
+    nobody = torch.zeros(1000, dtype=torch.bool)
+    for falls, after in ((0.03, 0.75), (0.021, 0.5), (0.019, 0.5), (0.011, 0.5), (0.009, 0.75), (0.0, 1.0), (0.0, 1.0)):
+        curriculum.falls_per_s = falls / 0.9  # a step without falls takes a tenth away
+        curriculum.step(nobody, 100)
+        assert curriculum.falls_per_s == pytest.approx(falls)
+        assert curriculum.arm_motion == pytest.approx(after)
+    for _ in range(9):
+        curriculum.step(~nobody, 100)
+    assert curriculum.arm_motion == 0.0
+
+
+def test_arms_move_wholly_where_nothing_else_is_asked_for():
+    curriculum = Curriculum(CurriculumConfig(), dt=1.0)
+    for _ in range(9):
+        curriculum.step(torch.ones(4, dtype=torch.bool), 10**9)
+    assert curriculum.arm_motion == 1.0
+
+
+def test_arms_rest_where_all_fall_and_move_again(make_env, robot):
+    cfg = CurriculumConfig(max_falls_per_s=0.02, arm_motion_samples=16.0)
+    env = make_env(4, robot=robot, curriculum=cfg)
+    default, off = env.motions.default, []
+    env.curriculum.falls_per_s = 1.0
+    for step in range(24):
+        if step == 12:
+            env.curriculum.falls_per_s = 0.0
+        _, _, _, extras = env.step(zeros(env))
+        off.append(float((env.motions.current().position - default).abs().max()))
+        env.episode_length_buf[:] = 0
+    assert off[0] > 0.05
+    assert max(off[9:12]) < 1e-6
+    assert float(extras["log"]["/curriculum/arm_motion"]) == env.curriculum.arm_motion == 1.0
+    assert off[-1] > 0.05
+
+
 def test_a_curriculum_goes_on_with_its_envs(make_env, robot):
     env, other = (make_env(2, robot=robot) for _ in range(2))
     drive(env, 3)
     env.curriculum.falls_per_s = 0.5
     other.load_state_dict(env.state_dict())
-    assert other.curriculum.state_dict() == {"samples": 6, "falls_per_s": 0.5}
+    assert other.curriculum.state_dict() == {"samples": 6, "falls_per_s": 0.5, "arm_motion": 1.0}
 
 
-def test_a_bad_limit_of_falls_is_named():
+def test_a_bad_curriculum_is_named():
     with pytest.raises(ValueError, match=r"curriculum\.max_falls_per_s"):
         CurriculumConfig(-0.1).check()
+    with pytest.raises(ValueError, match=r"curriculum\.arm_motion_samples"):
+        CurriculumConfig(arm_motion_samples=-1.0).check()
+    with pytest.raises(ValueError, match=r"curriculum\.arm_motion "):
+        Curriculum(CurriculumConfig(), 0.02).load_state_dict({"samples": 0, "falls_per_s": 0.0, "arm_motion": 1.5})
 
 
 def test_assistance_may_end_all_at_once():

@@ -19,7 +19,7 @@ def lively() -> HumanoidEnvConfig:
     cfg.forces.punches = PunchConfig(400.0, 0.1, 2.0)
     for part in (cfg.assist, cfg.forces.hand_loads, cfg.forces.pushes, cfg.randomization, cfg.observations.noise):
         part.enabled = True
-    cfg.path.share, cfg.motions.amplitude = 0.5, (0.0, 0.5)
+    cfg.path.share, cfg.curriculum.arm_motion_samples = 0.5, 1e6
     cfg.forces.hand_loads.hold_s, cfg.forces.hand_loads.ramp.full_samples = (1.0, 2.0), 1e9
     cfg.terminations.max_tilt_rad = 2.0
     return cfg

@@ -80,9 +80,10 @@ def test_root_velocity_of_a_circle_by_hand():
     torch.testing.assert_close(v[:, 2], torch.full((200,), 0.5), atol=1e-3, rtol=0)
 
 
-def play(cfg: ReferenceConfig, spec, num_envs=64, seconds=20.0, seed=0):
+def play(cfg: ReferenceConfig, spec, num_envs=64, seconds=20.0, seed=0, part=1.0):
     rng = torch.Generator().manual_seed(seed)
     motion = ReferenceMotion(cfg, spec, num_envs, DT)
+    motion.share = part
     motion.reset(everyone(num_envs), rng)
     positions, velocities, clips = [motion.current().position], [], []
     for _ in range(round(seconds / DT)):
@@ -118,41 +119,17 @@ def test_the_reference_keeps_to_position_and_velocity_limits(any_spec, share, tm
     assert float(clips.float().mean()) == pytest.approx(share, abs=0.06)
 
 
+@pytest.mark.parametrize("part", [0.0, 0.3])
 @pytest.mark.parametrize("clips", [0.0, 1.0])
-def test_motion_is_as_large_as_asked(any_spec, tmp_path, clips):
-    """The same motion, drawn alike; clips that never change, as transitions have a duration of their own."""
+def test_a_part_of_the_motion_is_asked_for(any_spec, tmp_path, part, clips):
+    """Of the same motion, drawn alike; clips that never change, as transitions have a duration of their own."""
     path = tmp_path / "own.npz"
     MotionLibrary([swaying(any_spec, "a", 0.0)], any_spec).save(path)
     cfg = ReferenceConfig(clips=ClipConfig(share=clips, hold_s=(60.0, 60.0), library=str(path)))
-    none, less, more = (play(replace(cfg, amplitude=(a, a)), any_spec, 8, 2.0) for a in (0.0, 0.3, 0.6))
+    whole, less = (play(cfg, any_spec, 8, 2.0, part=p) for p in (1.0, part))
     default = torch.tensor([any_spec.joints[i].default_rad for i in any_spec.indices(any_spec.upper_joints)])
-    torch.testing.assert_close(none[0], default.expand_as(none[0]))
-    torch.testing.assert_close(less[0], default + 0.5 * (more[0] - default), atol=1e-5, rtol=0)
-    torch.testing.assert_close(less[1], 0.5 * more[1], atol=1e-3, rtol=0)
-    assert float((more[0] - default).abs().max()) > 0.1
-
-
-def test_every_episode_draws_its_own_amplitude(any_spec):
-    rng, n = torch.Generator().manual_seed(0), 4000
-    motion = ReferenceMotion(ReferenceConfig(amplitude=(0.2, 0.8)), any_spec, n, DT)
-    motion.reset(everyone(n), rng)
-    first = motion._amplitude.clone()
-    assert first.shape == (n, 1)
-    assert 0.2 <= float(first.min()) < 0.21
-    assert 0.79 < float(first.max()) <= 0.8
-    assert float(first.mean()) == pytest.approx(0.5, abs=0.01)
-    again = torch.arange(n) < 10
-    motion.reset(again, rng)
-    assert torch.equal((motion._amplitude != first).squeeze(1), again)
-
-
-@pytest.mark.parametrize(
-    ("amplitude", "named"),
-    [((0.5, 0.2), r"motions\.amplitude must"), ((-0.1, 1.0), r"amplitude\[0\]"), ((0.0, 1.5), r"amplitude\[1\]")],
-)
-def test_a_bad_amplitude_is_named(amplitude, named):
-    with pytest.raises(ValueError, match=named):
-        ReferenceConfig(amplitude=amplitude).check()
+    torch.testing.assert_close(less[0], default + part * (whole[0] - default), atol=1e-5, rtol=0)
+    torch.testing.assert_close(less[1], part * whole[1], atol=1e-3, rtol=0)
 
 
 def test_transitions_are_slow_and_end_where_they_should(spec, tmp_path):

@@ -16,14 +16,13 @@ from cotap.checks import reason_of, require_range
 from cotap.envs.actions import ActionConfig
 from cotap.envs.commands import CommandConfig
 from cotap.envs.config import HumanoidEnvConfig
-from cotap.envs.curriculum import AssistConfig, RampConfig
+from cotap.envs.curriculum import AssistConfig, CurriculumConfig, RampConfig
 from cotap.envs.external_forces import ExternalForceConfig
 from cotap.envs.gait_phase import GaitConfig
 from cotap.envs.hand_loads import HandLoadConfig
 from cotap.envs.observations import ObservationConfig
 from cotap.envs.pushes import PushConfig
 from cotap.envs.rewards import UpperRewards
-from cotap.motions.reference import ReferenceConfig
 
 
 @dataclass
@@ -62,7 +61,7 @@ def default() -> BaseTraining:
         env=HumanoidEnvConfig(
             num_envs=1024,
             assist=AssistConfig(enabled=True),
-            motions=ReferenceConfig(amplitude=(0.0, 1.0)),
+            curriculum=CurriculumConfig(arm_motion_samples=3e6),
             forces=ExternalForceConfig(
                 hand_loads=HandLoadConfig(enabled=True, ramp=RampConfig(16e6, 60e6, first=0.1)),
                 pushes=PushConfig(enabled=True, velocity=(0.0, 1.2), ramp=RampConfig(20e6, 80e6, first=0.3)),
@@ -78,7 +77,7 @@ def quick() -> BaseTraining:
         env=HumanoidEnvConfig(
             num_envs=1024,
             assist=AssistConfig(enabled=True),
-            motions=ReferenceConfig(amplitude=(0.0, 1.0)),
+            curriculum=CurriculumConfig(arm_motion_samples=3e6),
         ),
         runner=RunnerConfig(iterations=1220),
     )
@@ -100,7 +99,7 @@ def paper() -> BaseTraining:
             ),
             gait=GaitConfig(period_s=1.0),
             assist=AssistConfig(enabled=True),
-            motions=ReferenceConfig(amplitude=(0.0, 1.0)),
+            curriculum=CurriculumConfig(arm_motion_samples=3e6),
             forces=ExternalForceConfig(
                 hand_loads=HandLoadConfig(
                     enabled=True, episode_share=1.0, torque_share=1.0, ramp=RampConfig(20e6, 100e6, first=0.1)

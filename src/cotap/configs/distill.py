@@ -10,7 +10,7 @@ from cotap.agents.distillation import DistillationConfig
 from cotap.compliance.laws import LawConfig
 from cotap.configs.base import BaseTraining, track_as_facet
 from cotap.envs.arm_task import TASK_WEIGHTS, task_forces
-from cotap.envs.curriculum import AssistConfig, RampConfig
+from cotap.envs.curriculum import AssistConfig, CurriculumConfig, RampConfig
 from cotap.envs.modulation import ModulationConfig
 from cotap.envs.upper_body import LawSampling, UpperBodyConfig
 
@@ -67,7 +67,7 @@ def paper(base: BaseTraining) -> DistillTraining:
 def _after_base(training: DistillTraining, base: BaseTraining) -> None:
     """What the base has learned is there from the start, and exploration goes on from where the base's ended."""
     env = training.env
-    env.assist, env.motions.amplitude = AssistConfig(), (1.0, 1.0)
+    env.assist, env.curriculum = AssistConfig(), CurriculumConfig()
     env.forces.pushes.ramp, env.forces.hand_loads.ramp = RampConfig(), RampConfig()
     halvings = base.runner.iterations * base.ppo.steps * base.env.num_envs / base.ppo.std_half_life
     training.ppo.initial_std = max(base.ppo.least_std, base.ppo.initial_std * 0.5**halvings)

@@ -1,4 +1,5 @@
-"""What changes as training goes on, by samples: disturbances grow, and the wrench that assists first steps fades."""
+"""What changes as training goes on: disturbances grow with the samples, the wrench that assists first steps fades with
+them, and arms move less while many robots fall."""
 
 from __future__ import annotations
 
@@ -44,38 +45,49 @@ class RampConfig:
 
 @dataclass
 class CurriculumConfig:
-    """When disturbances grow with the samples, and when they wait. The assistance does not wait: robots that keep it
-    lean on it."""
+    """What many falls hold back. The assistance fades all the same: robots that keep it lean on it."""
 
     max_falls_per_s: float = 0.02
-    """Falls per second and env above which no disturbance grows."""
+    """Falls per second and env above which no disturbance grows and the arms' motion shrinks; it grows below half of
+    that."""
+    arm_motion_samples: float = 0.0
+    """Samples in which the arms' motion shrinks from whole to none, or grows back; 0 leaves it whole."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
         require_range("curriculum.max_falls_per_s", self.max_falls_per_s, 0.0, 1e3)
+        require_range("curriculum.arm_motion_samples", self.arm_motion_samples, 0.0, 1e15)
 
 
 class Curriculum:
-    """How far disturbances have grown: the samples, but for those that were taken while robots fell too often."""
+    """How far disturbances have grown (the samples, but for those that were taken while robots fell too often), and how
+    far arms move."""
 
     def __init__(self, cfg: CurriculumConfig, dt: float) -> None:
         self._cfg, self._dt = cfg, dt
         self._share = min(dt / _FALLS_OVER_S, 1.0)
         self.samples, self.falls_per_s = 0, 0.0
+        self.arm_motion = 1.0
+        """Share of the way from the default pose to the motion that is drawn for the arms."""
 
     def step(self, fell: torch.Tensor, samples: int) -> None:
         """Count the `samples` of a step in which the envs of `fell` (N,) have fallen."""
         self.falls_per_s += self._share * (float(fell.float().mean()) / self._dt - self.falls_per_s)
-        if self.falls_per_s <= self._cfg.max_falls_per_s:
+        limit, whole = self._cfg.max_falls_per_s, self._cfg.arm_motion_samples
+        if self.falls_per_s <= limit:
             self.samples += samples
+        way = -1 if self.falls_per_s > limit else 1 if self.falls_per_s < 0.5 * limit else 0
+        if whole:
+            self.arm_motion = min(1.0, max(0.0, self.arm_motion + way * samples / whole))
 
     def state_dict(self) -> dict[str, float]:
         """What goes on from step to step."""
-        return {"samples": self.samples, "falls_per_s": self.falls_per_s}
+        return {"samples": self.samples, "falls_per_s": self.falls_per_s, "arm_motion": self.arm_motion}
 
     def load_state_dict(self, state: dict[str, float]) -> None:
         """Take over what `state_dict` returned. Raises KeyError or TypeError for something else."""
         self.samples, self.falls_per_s = int(state["samples"]), float(state["falls_per_s"])
+        self.arm_motion = require_range("curriculum.arm_motion", float(state.get("arm_motion", 1.0)), 0.0, 1.0)
 
 
 @dataclass

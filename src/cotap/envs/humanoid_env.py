@@ -107,6 +107,7 @@ class HumanoidEnv(VecEnv):
         self._assist = AssistWrench(cfg.assist, spec, torch.as_tensor(torso_inertia(spec, model)), dt)
         self._torso = model.body(spec.torso_body).id
         self.curriculum = Curriculum(cfg.curriculum, dt)
+        self.motions.share = self.curriculum.arm_motion
         self._min_height_m = cfg.terminations.min_height_m(spec)
         self.samples = self.num_diverged = 0
         self.keeps_final_observation = False
@@ -207,6 +208,7 @@ class HumanoidEnv(VecEnv):
 
     def _act(self, action: torch.Tensor) -> None:
         """Send targets and set forces. The reference moves first: arms are sent where it will be at the step's end."""
+        self.motions.share = self.curriculum.arm_motion
         self.motions.step(self.rng)
         reference = self.motions.current()
         joints, laws = action.tensor_split((self._num_joints,), 1)
@@ -244,6 +246,7 @@ class HumanoidEnv(VecEnv):
             log |= self.upper_body.log | {"/law/saturated": at_limit[:, self.num_lower :].float().mean()}
         log["/episode/diverged"] = torch.tensor(float(self.num_diverged))
         log["/curriculum/assist"] = torch.tensor(self.cfg.assist.share(self.samples))
+        log["/curriculum/arm_motion"] = torch.tensor(self.curriculum.arm_motion)
         log["/curriculum/samples"] = torch.tensor(float(self.curriculum.samples))
         return torch.stack(totals, 1).masked_fill(bad.unsqueeze(1), 0.0), log
 

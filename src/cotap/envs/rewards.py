@@ -175,11 +175,10 @@ class LowerRewards:
         """Velocity averaged over about half a stride: what sways with every step is no reason to walk too slowly."""
         return torch.exp(-s.mean_error[:, :2].square().sum(1) / 0.015)
 
-    @term(3.0)
+    @term(1.0)
     def track_yaw_rate(s: StepRecord) -> torch.Tensor:
-        """Angular velocity about the vertical against its command, wide kernel: a light torso that swings to and fro by
-        1 rad/s gets nothing from the narrow ones."""
-        return torch.exp(-(s.command.yaw_rate - s.state.yaw_rate).square() / 0.5)
+        """Angular velocity about the vertical against its command, wide kernel."""
+        return torch.exp(-(s.command.yaw_rate - s.state.yaw_rate).square())
 
     @term(2.0)
     def track_yaw_rate_closely(s: StepRecord) -> torch.Tensor:

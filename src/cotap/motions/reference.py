@@ -70,16 +70,11 @@ class ReferenceConfig:
 
     generator: MotionConfig = field(default_factory=MotionConfig)
     clips: ClipConfig = field(default_factory=ClipConfig)
-    amplitude: tuple[float, float] = (1.0, 1.0)
-    """Part of the way from the default pose to that motion; an env draws its own for each episode."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
         self.generator.check()
         self.clips.check()
-        require_interval("motions.amplitude", self.amplitude)
-        for i, bound in enumerate(self.amplitude):
-            require_range(f"motions.amplitude[{i}]", bound, 0.0, 1.0)
 
 
 def plays_clips(cfg: ClipConfig, spec: RobotSpec) -> bool:
@@ -121,11 +116,11 @@ class ReferenceMotion(Stateful):
     speed asks for; beyond that no step of the reference exceeds the joints' velocity limits.
     """
 
-    STATE = ("_amplitude", "_from_clip", "_remaining_s", "_offset", "_fade_s", "_since_s", "_position", "_velocity")
+    STATE = ("_from_clip", "_remaining_s", "_offset", "_fade_s", "_since_s", "_position", "_velocity")
 
     def __init__(self, cfg: ReferenceConfig, spec: RobotSpec, num_envs: int, dt: float) -> None:
         cfg.check()
-        self.cfg, self._amplitudes, self._dt = cfg.clips, cfg.amplitude, dt
+        self.cfg, self._dt = cfg.clips, dt
         self.generator = MotionGenerator(cfg.generator, spec, num_envs, dt)
         self.default = self.generator.default
         joints = [spec.joints[i] for i in spec.indices(spec.upper_joints)]
@@ -140,7 +135,6 @@ class ReferenceMotion(Stateful):
         limit = torch.tensor([j.velocity_limit_rad_s for j in joints])
         self._largest_step, self._blend_speed = dt * limit, cfg.clips.blend_speed * limit
         n = num_envs
-        self._amplitude = torch.full((n, 1), cfg.amplitude[1])
         self._from_clip = torch.zeros(n, dtype=torch.bool)
         self._remaining_s = torch.zeros(n)
         self._offset = torch.zeros(n, len(joints))
@@ -149,6 +143,8 @@ class ReferenceMotion(Stateful):
         self._velocity = torch.zeros(n, len(joints))
         self._fixed = False
         self._led: str | None = None
+        self.share = 1.0
+        """Share of the way from the default pose to motion that arms are asked to go; poses that are held aside."""
 
     def lead(self, motion: str) -> None:
         """Take all envs from where their arms are, held or not, into `motion`, until further notice: a clip's name,
@@ -179,8 +175,6 @@ class ReferenceMotion(Stateful):
             return
         self.generator.reset(mask, rng)
         self._draw(mask, rng)
-        if self._amplitudes != (1.0, 1.0):
-            self._amplitude[mask] = uniform(rng, *self._amplitudes, int(mask.sum())).unsqueeze(1)
         self._offset[mask] = 0.0
         raw, ids = self._raw(), mask.nonzero().squeeze(1)
         self._position = self._position.index_put((ids,), raw.position[ids].clamp(self._low, self._high))
@@ -241,7 +235,7 @@ class ReferenceMotion(Stateful):
             self.clips.start(mask, self.clips.names.index(motion))
 
     def _raw(self) -> ArmReference:
-        """What generator or clip ask for, or that part of it, transitions aside."""
+        """What generator or clip ask for, or the share of it, transitions aside."""
         motion = self.generator.current()
         if self._led == REST:
             return ArmReference(self.default.expand_as(motion.position), torch.zeros_like(motion.velocity))
@@ -251,11 +245,9 @@ class ReferenceMotion(Stateful):
                 torch.where(chosen, self.clips.current(), motion.position),
                 motion.velocity.masked_fill(chosen, 0.0),
             )
-        if self._amplitudes == (1.0, 1.0):
+        if self.share == 1.0:
             return motion
-        return ArmReference(
-            self.default + self._amplitude * (motion.position - self.default), self._amplitude * motion.velocity
-        )
+        return ArmReference(self.default.lerp(motion.position, self.share), self.share * motion.velocity)
 
     def _advance(self, rng: torch.Generator) -> torch.Tensor:
         """Advance generator and clips, change motions that are due, and return the raw positions (N, U)."""
