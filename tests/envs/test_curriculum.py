@@ -130,9 +130,9 @@ def test_arms_rest_where_all_fall_and_move_again(make_env, robot):
 def test_a_curriculum_goes_on_with_its_envs(make_env, robot):
     env, other = (make_env(2, robot=robot) for _ in range(2))
     drive(env, 3)
-    env.curriculum.falls_per_s = 0.5
+    env.curriculum.falls_per_s, env.curriculum.arm_motion = 0.5, 0.25
     other.load_state_dict(env.state_dict())
-    assert other.curriculum.state_dict() == {"samples": 6, "falls_per_s": 0.5, "arm_motion": 1.0}
+    assert other.curriculum.state_dict() == {"samples": 6, "falls_per_s": 0.5, "arm_motion": 0.25}
 
 
 def test_a_bad_curriculum_is_named():

@@ -73,19 +73,21 @@ class Curriculum:
     def step(self, fell: torch.Tensor, samples: int) -> None:
         """Count the `samples` of a step in which the envs of `fell` (N,) have fallen."""
         self.falls_per_s += self._share * (float(fell.float().mean()) / self._dt - self.falls_per_s)
-        limit, whole = self._cfg.max_falls_per_s, self._cfg.arm_motion_samples
+        limit = self._cfg.max_falls_per_s
         if self.falls_per_s <= limit:
             self.samples += samples
-        way = -1 if self.falls_per_s > limit else 1 if self.falls_per_s < 0.5 * limit else 0
-        if whole:
-            self.arm_motion = min(1.0, max(0.0, self.arm_motion + way * samples / whole))
+        if self._cfg.arm_motion_samples > 0.0:
+            direction = -1 if self.falls_per_s > limit else 1 if self.falls_per_s < 0.5 * limit else 0
+            change = direction * samples / self._cfg.arm_motion_samples
+            self.arm_motion = min(1.0, max(0.0, self.arm_motion + change))
 
     def state_dict(self) -> dict[str, float]:
         """What goes on from step to step."""
         return {"samples": self.samples, "falls_per_s": self.falls_per_s, "arm_motion": self.arm_motion}
 
     def load_state_dict(self, state: dict[str, float]) -> None:
-        """Take over what `state_dict` returned. Raises KeyError or TypeError for something else."""
+        """Take over what `state_dict` returned; an older one has no `arm_motion`, as arms always moved wholly. Raises
+        KeyError, TypeError or ValueError for something else."""
         self.samples, self.falls_per_s = int(state["samples"]), float(state["falls_per_s"])
         self.arm_motion = require_range("curriculum.arm_motion", float(state.get("arm_motion", 1.0)), 0.0, 1.0)
 
