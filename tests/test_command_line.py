@@ -165,6 +165,7 @@ def test_an_interrupted_command_ends_without_a_traceback(command, work, argument
     assert "Traceback" not in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["train", "evaluate", "deploy"])
 def test_a_usage_message_loads_no_compiler_and_no_library_that_it_does_not_need(name):
     heavy = "{'torch._dynamo', 'sympy', 'scipy', 'matplotlib'}"

@@ -40,6 +40,7 @@ def small(table: str, folder: Path, *options: str) -> dict:
     return json.loads((folder / f"{table}.json").read_text())
 
 
+@pytest.mark.slow
 def test_static_table(tmp_path, capsys, policy):
     options = ["--pelvis", "fixed", "--num-envs", "6", "--settle-seconds", "2", "--laws", "cotap, task error", "facet"]
     content = small("static", tmp_path, *policy, *options)
@@ -50,6 +51,7 @@ def test_static_table(tmp_path, capsys, policy):
     assert "0.043 / 0.068 / 0.106 |" in text  # the paper's
 
 
+@pytest.mark.slow
 def test_transient_table(tmp_path, policy):
     """A law that adds no damping to that of PD, and one that is damped critically: the second does not swing."""
     options = ["--pelvis", "fixed", "--num-envs", "2", "--forces", "200", "--laws", "facet", "cotap, task error"]
@@ -60,6 +62,7 @@ def test_transient_table(tmp_path, policy):
     assert "cotap, task error, oscillation beside facet's: **less**" in text
 
 
+@pytest.mark.slow
 def test_properties_table(tmp_path):
     content = small("properties", tmp_path, "--stability.poses", "4", "--stability.num-envs", "2",
                     "--stability.episode-seconds", "0.2", "--stability.settle-seconds", "0.5", "--settle-seconds", "2",

@@ -69,6 +69,7 @@ def test_an_arm_elsewhere_feels_as_was_asked(monkeypatch, asked):
         np.testing.assert_allclose(own_arm.displacement(force), closed_form, atol=0.02 * closed_form[axis])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("in_tmp_path")
 def test_a_motion_of_ones_own_is_played():
     own_motion.write_library("own.npz")
@@ -102,6 +103,7 @@ def test_a_training_with_it_makes_a_policy_like_any_other():
     assert load_policy(checkpoint).env_config.rewards.lower.track_height == 1.5
 
 
+@pytest.mark.slow
 def test_a_protocol_of_ones_own_runs(monkeypatch, tmp_path):
     monkeypatch.setitem(evaluate.PROTOCOLS, "turning", None)  # so that it is taken out again
     runpy.run_path(str(EXAMPLES / "own_protocol.py"))

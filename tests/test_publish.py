@@ -25,6 +25,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "checkpoints"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "stage", "method"), [("h1-base", "base", "pd"), ("h1-cotap", "distill", "cotap")])
 def test_weights_provenance_and_evaluations_are_written(
     tmp_path: Path, package: Path, name: str, stage: str, method: str

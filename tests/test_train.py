@@ -627,6 +627,7 @@ def test_without_a_stage_both_run_and_are_summed_up(tmp_path: Path, monkeypatch:
     assert f"cotap play --checkpoint {out / 'distill' / 'checkpoint_000001.pt'}" in said
 
 
+@pytest.mark.slow
 def test_the_quick_pipeline_is_a_small_version_of_both(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     assert PipelineOptions(quick=True).iterations() == (1220, 610)
     assert PipelineOptions().iterations() == (12_207, 6103)
@@ -637,6 +638,7 @@ def test_the_quick_pipeline_is_a_small_version_of_both(tmp_path: Path, monkeypat
         assert not newest(tmp_path / stage)["config"]["training"]["env"]["forces"]["pushes"]["enabled"]
 
 
+@pytest.mark.slow
 def test_the_pipelines_first_stage_may_have_another_recipe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     tiny_networks(monkeypatch)
     assert run("--base-recipe", "facet", *BOTH, RUN_DIR, tmp_path) == 0

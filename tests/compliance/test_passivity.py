@@ -237,6 +237,7 @@ def test_without_the_filter_the_same_command_gives_energy_without_end():
     assert 0.1 < float(held.drawn.max()) <= STORE.first - STORE.floor + 1e-9  # and it does get at the store
 
 
+@pytest.mark.slow
 def test_an_optimised_exciter_gets_the_store_and_no_more(rng):
     """Random search that goes on from its best: frequencies, phases and sizes of command and force, and braking."""
     batch = 128

@@ -83,6 +83,7 @@ def test_the_loop_is_the_environment(name, mode, law, random_checkpoint, random_
     side_by_side(random_checkpoint(**kind), random_policy(**kind), laws_named(law))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "modulation"), MODULATED)
 def test_the_loop_is_the_environment_where_the_policy_sets_the_laws(name, modulation, random_checkpoint, random_policy):
     kind: dict[str, Any] = {"robot": name, "output_gain": 1.0, "modulation": modulation}

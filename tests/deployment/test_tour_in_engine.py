@@ -64,6 +64,7 @@ def steps(monkeypatch):
     return seen
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", ["pd", "cotap"])
 @pytest.mark.parametrize("robot", SHIPPED_ROBOTS)
 def test_the_loop_in_mujoco_scores_as_the_batch_does(robot, law, checkpoint_of):

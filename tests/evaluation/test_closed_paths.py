@@ -137,6 +137,7 @@ def test_a_path_out_of_reach_is_not_found(arms, target, rng):
     assert not loop.found.any()
 
 
+@pytest.mark.slow
 def test_the_script_writes_its_table(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(script, "ROWS", {k: v for k, v in script.ROWS.items() if k == "PD" or "joint error, 300" in k})
     assert script.main(["--poses", "2", "--points", "8", "--radius", "0.02", "--output", str(tmp_path)]) == 0

@@ -254,6 +254,7 @@ def test_the_same_seed_gives_the_same_json_and_more_threads_the_same_figures(che
         assert two[0] <= one[1], name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("protocol", ["impact", "constant-load"])
 def test_the_command_writes_what_was_asked_for(protocol, checkpoint, tmp_path, capsys):
     out = tmp_path / "out.json"

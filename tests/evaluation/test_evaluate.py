@@ -27,6 +27,7 @@ def test_a_name_whose_checkpoint_is_not_there_is_refused():
         shipped_checkpoint("h1-base" if "h1-base" not in shipped_names() else "h2-base")
 
 
+@pytest.mark.slow
 def test_same_seed_same_json_but_for_seconds(tmp_path: Path, checkpoint: Path):
     first, second = (run(tmp_path, checkpoint, name=f"{i}.json") for i in range(2))
     other = run(tmp_path, checkpoint, "--seed", "1", name="other.json")
@@ -45,6 +46,7 @@ def test_hands_are_loaded_as_asked(loaded):
     assert loads.ramp.share(0.0) == 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("option", "arms"), [([], "moving"), (["--motion", "none"], "held")])
 def test_results_say_whether_arms_move(checkpoints, robot, option, arms, capsys):
     options = ("--num-envs", "2", "--episode-seconds", "3", "--command-seconds", "2", "--threads", "1", "--hand-loads")
@@ -102,11 +104,13 @@ def test_outputs_that_cannot_be_are_found_before_the_work(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_plot_is_written(tmp_path: Path, checkpoint: Path):
     run(tmp_path, checkpoint, "--plot", str(tmp_path / "plot.png"))
     assert (tmp_path / "plot.png").read_bytes()[:4] == b"\x89PNG"
 
 
+@pytest.mark.slow
 def test_the_video_is_of_the_laws_that_were_asked_for(
     tmp_path: Path, checkpoint: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -118,6 +122,7 @@ def test_the_video_is_of_the_laws_that_were_asked_for(
     assert not filmed[0].singularity_ratio
 
 
+@pytest.mark.slow
 def test_the_tour_is_filmed_with_the_arms_as_they_were_evaluated(
     tmp_path: Path, checkpoint: Path, monkeypatch: pytest.MonkeyPatch
 ):

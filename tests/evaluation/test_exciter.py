@@ -113,6 +113,7 @@ def test_energy_is_drawn_from_what_is_active_and_none_from_pd(monkeypatch):
     assert result["metrics"]["pushing, sine"] == result["rows"]["pushing"]["sine"]["drawn"]
 
 
+@pytest.mark.slow
 def test_a_store_bounds_what_an_exciter_that_knows_the_law_draws(rng):
     """With the PD law's weak damping, soft while it pulls and stiff while it brakes."""
     free, held = "cotap:damping=pd", "cotap:damping=pd,passive=true,store_energy=0.2"

@@ -60,6 +60,7 @@ def test_every_env_takes_the_impulse_it_is_counted_under(robot, place):
     torch.testing.assert_close(impulse.norm(dim=1), IMPULSES, atol=0.01, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_command_prints_the_curve(checkpoint, tmp_path, capsys):
     arguments = ["--num-envs", "6", "--levels", "3", "--mode", "walking", "--place", "base", "--threads", "1",
                  "--json", str(tmp_path / "out.json"), "--plot", str(tmp_path / "p.png")]  # fmt: skip

@@ -74,6 +74,7 @@ def test_one_pose_one_axis(error, allowed):
     assert result.effective_stiffness()[:2] == [None, None]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("error", "expected"),
     [
@@ -95,6 +96,7 @@ def test_heavy_load(error, expected):
     assert moved.tolist() == pytest.approx(list(expected.values()), rel=0.01)
 
 
+@pytest.mark.slow
 def test_an_asked_for_table_by_axis(checkpoint, tmp_path, capsys):
     out = tmp_path / "static.json"
     arguments = ["static-stiffness", "--checkpoint", str(checkpoint), "--num-envs", "4", "--arm-pose", "0", "0", "0",
@@ -112,6 +114,7 @@ def test_an_asked_for_table_by_axis(checkpoint, tmp_path, capsys):
     assert "| x | 1 | 0.0050 | 200.0 |" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_the_right_arm_is_the_lefts_mirror_image():
     left = run_hand("left", (0.5, 1.0, -1.0))
     right = run_hand("right", (0.5, -1.0, -1.0))

@@ -116,6 +116,7 @@ def test_its_alpha_is_what_was_asked_for(checkpoint_of, capsys):
     assert "episode_seconds" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_grid_compares_with_its_best(checkpoint_of, tmp_path, capsys):
     args = ["--checkpoint", str(checkpoint_of), "--alphas", "0", "1", "--stiffnesses", "100", "900", "--num-envs", "4"]
     assert grid([*args, "--episode-seconds", "0.4", "--output", str(tmp_path)]) == 0

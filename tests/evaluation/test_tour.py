@@ -190,6 +190,7 @@ def test_a_fall_is_a_low_pelvis_and_nothing_else(robot):
     assert measured["num_falls"] == int(low.any(0).sum())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", [[], ["--method", "cotap", "--stiffness", "300"]])
 def test_the_command_writes_json_table_and_plot(checkpoints, robot, law, tmp_path, capsys):
     out, plot = tmp_path / "tour.json", tmp_path / "tour.png"

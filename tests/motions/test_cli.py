@@ -77,6 +77,7 @@ def test_import_reads_at_the_rate_that_is_given(tmp_path: Path, spec, capsys):
     assert MotionLibrary.load(out, spec).clips[0].seconds == pytest.approx(1.5)  # the old file is untouched
 
 
+@pytest.mark.slow
 def test_show_writes_a_plot_for_every_clip_and_a_sheet(tmp_path: Path, capsys):
     assert main(["show", "--clip", "punch", "--clip", "walk", "--output", str(tmp_path / "out")]) == 0
     said = capsys.readouterr()

@@ -27,6 +27,7 @@ assert both.lock_().unlock_()["a"].shape == (2, 3)
 """
 
 
+@pytest.mark.slow
 def test_the_page_answers_without_torch_and_the_simulation_runs_without_its_compiler():
     subprocess.run([sys.executable, "-c", LOADED], check=True)
 
