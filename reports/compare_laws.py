@@ -78,7 +78,7 @@ class Static:
     """Downward displacement of the left hand under 10, 30 and 50 N downward, every law (paper, Table VI)."""
 
     checkpoint: str = ""
-    """Policy (pelvis free); by default the shipped CoTaP policy."""
+    """Policy (pelvis free); by default the shipped CoTaP policy, or else the base."""
     facet_checkpoint: str = ""
     """Policy of the row facet; by default as the others."""
     pelvis: str = "free"
@@ -121,11 +121,10 @@ class Static:
             with redirect_stdout(StringIO()):  # its own table
                 result = run("static-stiffness", options)
             curve = result["curve"]
-            moved = [(_down(curve["displacement"][i]), curve["spread"][i][2]) for i in (1, 3, 5)]
+            levels = (1, 3, 5)
             rows[name] = {
-                "displacement": [m for m, _ in moved],
-                # Of the mean; envs that fell are few or the mean is none.
-                "half_interval": [1.96 * std / (self.num_envs / 6) ** 0.5 for _, std in moved],
+                "displacement": [_down(curve["displacement"][i]) for i in levels],
+                "half_interval": [_half_interval(curve["spread"][i][2], curve["standing"][i]) for i in levels],
                 "torque_saturated": result["torque_saturated"],
                 "num_falls": result["num_falls"],
                 "num_envs": result["num_envs"],
@@ -142,7 +141,7 @@ class Static:
         near = []
         for name, row in result["rows"].items():
             cells = [
-                "-" if got is None else f"{got:.4f} +- {half:.4f} ({got / ideal - 1.0:+.0%})"
+                "-" if got is None or half is None else f"{got:.4f} +- {half:.4f} ({got / ideal - 1.0:+.0%})"
                 for got, half, ideal in zip(row["displacement"], row["half_interval"], result["ideal"], strict=True)
             ]
             paper = " / ".join(f"{v:g}" for v in STATIC[name]) if name in STATIC else ""
@@ -152,12 +151,17 @@ class Static:
             pairs = zip(row["displacement"], result["ideal"], strict=True)
             if all(got is not None and abs(got / ideal - 1.0) <= 0.1 for got, ideal in pairs):
                 near.append(name)
-        pelvis = f"Pelvis {self.pelvis}, {self.num_envs / 6:g} envs per load, {self.stiffness:g} N/m."
+        pelvis = f"Pelvis {self.pelvis}, arms held, {self.num_envs / 6:g} envs per load, {self.stiffness:g} N/m."
         return "\n".join([*lines, "", f"{pelvis} Within 10 % of ideal at all loads: {'; '.join(near) or 'none'}."])
 
     def draw(self, result: dict[str, Any]) -> Any:
         """Displacement against load."""
         return draw_static(result)
+
+
+def _half_interval(std: float, envs: int) -> float | None:
+    """Of the mean over so many envs, with 95 % probability; None of fewer than two."""
+    return 1.96 * std / envs**0.5 if envs > 1 else None
 
 
 def _down(displacement: list[float | None]) -> float | None:
@@ -174,7 +178,7 @@ class Transient:
     """What a hand does after a push on it, every law (paper, Fig. 9): error over time, energy of its oscillation."""
 
     checkpoint: str = ""
-    """Policy; by default the shipped CoTaP policy."""
+    """Policy; by default the shipped CoTaP policy, or else the base."""
     facet_checkpoint: str = ""
     """Policy of the row facet; by default as the others."""
     forces: tuple[float, ...] = (200.0, 500.0)
@@ -229,7 +233,7 @@ class Transient:
         lines = []
         for force, rows in result["forces"].items():
             lines += [
-                f"**{force} N for 50 ms, {self.mode}, pelvis {self.pelvis}, {self.stiffness:g} N/m**", "",
+                f"**{force} N for 50 ms, {self.mode}, pelvis {self.pelvis}, arms held, {self.stiffness:g} N/m**", "",
                 "| law | error of the hand, mean of 1 s [m] | arms at their torque limit "
                 "| energy of the hand's motion [J/kg] | of its oscillation [J/kg] | overshoot | swings | settled [s] "
                 "| fell |",

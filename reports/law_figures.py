@@ -24,8 +24,8 @@ def draw_static(result: dict[str, Any]) -> Any:
     axis.plot(loads, result["ideal"], "k--", lw=1.5, label="ideal")
     colors = plt.get_cmap("tab20")(np.linspace(0.0, 1.0, max(2, len(result["rows"]))))
     for color, (name, row) in zip(colors, result["rows"].items(), strict=True):
-        moved = [np.nan if v is None else v for v in row["displacement"]]
-        axis.errorbar(loads, moved, row["half_interval"], marker="o", ms=3, lw=1.2, color=color, label=name)
+        moved, half = ([np.nan if v is None else v for v in row[k]] for k in ("displacement", "half_interval"))
+        axis.errorbar(loads, moved, half, marker="o", ms=3, lw=1.2, color=color, label=name)
     axis.set(xlabel="load on the hand, downward [N]", ylabel="displacement, downward [m]", xticks=loads)
     axis.grid(alpha=0.2)
     axis.legend(frameon=False, fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))

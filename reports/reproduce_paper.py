@@ -38,12 +38,13 @@ PARTS: dict[str, Callable[[Book], None]] = {
     "pictures": pictures,
 }
 HEAD = """Written by `{command}`: do not edit. {envs} envs a row unless said otherwise. Means are over the envs that
-stood, with bootstrap 95 % intervals; shares of falls are over all envs, to the end of the episode, with Wilson's. One
+stood unless said otherwise, with bootstrap 95 % intervals; shares of falls are over all envs, from the start to the end
+of the episode, with Wilson's. Arms that move play clips half of the time and generated motion otherwise. One
 training stands behind each policy unless said otherwise: intervals are over envs, not over trainings. A difference
 between two rows is taken env by env, over those that stood in both; both begin with the same friction, masses, motion
 and direction of the push."""
 IMPACT = """The impact is 500 N for 50 ms at the left hand, along x in stance, in a random horizontal direction while
-walking at 0.5 m/s, arms following clips; measured for 1 s from its onset. Friction, masses, gains and delay are
+walking at 0.5 m/s, arms moving; measured for 1 s from its onset. Friction, masses, gains and delay are
 randomised, the torque limits are {robot}'s own. *K 100* is CoTaP at 100 N/m in x and y and 300 N/m in z, k_null 25
 Nm/rad, and alpha 1 unless it is named. The paper measured H1 in Isaac Gym,
 with 4096 envs, and gives neither window nor torque limits: orderings and ratios compare, digits do not."""
@@ -62,7 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--only", nargs="+", default=[], metavar="PART", help=f"parts: {', '.join(PARTS)}")
     parser.add_argument("--reuse", action="store_true", help="keep evaluations that are there already")
     parser.add_argument(
-        "--policies", nargs="+", default=[], metavar="NAME=CHECKPOINT",
+        "--policies", nargs="+", default=[], action="extend", metavar="NAME=CHECKPOINT",
         help=f"names: {', '.join(POLICIES)}; by default cotap and base are those that ship",
     )  # fmt: skip
     parser.add_argument("--out", type=Path, help="folder of the page, in place of those above")
@@ -75,7 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name, part in PARTS.items():
         if not options.only or name in options.only:
             part(book)
-    book.write()
+            book.write()  # what is there, should a later part fail
     print(f"\nwritten: {book.page}")
     return 0
 

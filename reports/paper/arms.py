@@ -11,6 +11,8 @@ SOFT_SHARE = 0.3
 """Gain of the paper's soft PD, kp 30, over that of its PD, kp 100."""
 COMPLIANT = ("K 100", "K 500", "K 800", "alpha 0.3, K 100", "alpha 0.7, K 100")
 """Names of the rows under CoTaP."""
+CALM = ["--force", "0", "0", "0"]
+"""Of an impact: none."""
 
 
 def cotap(x: float, y: float, z: float, alpha: float | None = None) -> list[str]:

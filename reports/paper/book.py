@@ -13,7 +13,7 @@ PAIRED = ("impact", "constant-load")
 """Protocols that write every env's figures, so that two evaluations are compared env by env."""
 KEPT = (
     "protocol", "method", "num_envs", "num_falls", "window", "fidelity", "num_wrong_way", "num_unholdable",
-    "error_quantiles", "coverage", "impulse_50", "fall_curve",
+    "error_quantiles", "coverage", "impulse_50", "fall_curve", "falls",
 )  # fmt: skip
 """What results.json keeps of an evaluation, beside the measures that the page shows."""
 WITHOUT_FALLS = (*PAIRED, "periodic-load")
@@ -74,7 +74,7 @@ class Book:
         return load_checkpoint(find_checkpoint(self.policies[policy]))
 
     def run(self, name: str, policy: str, *args: str, envs: int = 0) -> dict[str, Any] | None:
-        """The result of `cotap evaluate ARGS` under `name`; None where there is no checkpoint of its policy.
+        """The result of `cotap evaluate ARGS` under `name`, run once; None where there is no checkpoint of its policy.
 
         Args:
             name: What the result is kept under.
@@ -82,8 +82,8 @@ class Book:
             args: Protocol and options.
             envs: Envs, those of the book by default.
         """
-        if not self.has(policy):
-            return None
+        if name in self.results or not self.has(policy):
+            return self.results.get(name)
         paired = ["--per-env"] if args[0] in PAIRED else []
         arguments = [args[0], "--num-envs", str(envs or self.envs), *paired, *args[1:]]
         path = self.evaluations / f"{name}.json"

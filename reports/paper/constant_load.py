@@ -34,8 +34,8 @@ def constant_load(book: Book) -> None:
     """Displacement and error of the hand under -50 N."""
     book.add("", "## Constant load (the paper's Fig. 3)")
     book.paragraph(
-        "-50 N in z on the left hand from 1 s on, stance, x and y 300 N/m; 2 to 4 s after the onset. Displacements are "
-        "relative to the half second before."
+        "-50 N in z on the left hand from 1 s on, stance, arms held, x and y 300 N/m; 2 to 4 s after the onset. "
+        "Displacements are relative to the half second before."
     )
     book.table("arms", "displacement in z [m]", "hand error [m]", "first beyond its rest by", "fell [%]", book.paper)
     curves = {}

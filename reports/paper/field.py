@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from reports.paper.ablation import CALM
-from reports.paper.arms import PD, label, mass
+from reports.paper.arms import CALM, PD, label, mass
 from reports.paper.book import Book
 from reports.paper.words import hundredfold, missing
 
@@ -14,8 +13,8 @@ LAWS = {PD: ["--method", "pd"]} | {
 }
 LOAD_N = 15.0
 LONGER = ["--window", "0", "3"]
-WHAT = """Free: standing while the arms follow clips and nothing pushes, for 3 s. Loaded: {load:g} N down on the left
-hand, held, arms in their default pose. The impedance error is the distance of the hand from where a spring of the
+WHAT = """Free: standing while the arms move and nothing pushes, for 3 s. Loaded: {load:g} N down on the left
+hand, arms held in their default pose. The impedance error is the distance of the hand from where a spring of the
 stiffness that it was asked for would let it go; PD is asked for none. A joint is near its limit above nine tenths of
 it."""
 ROWS = (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from reports.paper.arms import COMPLIANT, PD, SOFT, arms, label, mass
+from reports.paper.arms import CALM, COMPLIANT, PD, SOFT, arms, label, mass
 from reports.paper.book import Book, slug
 from reports.paper.relative import keep_changes
 from reports.paper.tables import IMPACT, ORDERINGS
@@ -38,7 +38,7 @@ fall, or do not walk as commanded, would explain them. At K 100 ours have an err
 left out; {fell} % fell."""
 
 ANY_FORCE_N = (500.0, 1000.0)
-ANY_DIRECTION = """The push of 50 ms at the left hand has a random horizontal direction, arms following clips."""
+ANY_DIRECTION = """The push of 50 ms at the left hand has a random horizontal direction; the arms move."""
 
 COMPARED = """By the 95 % intervals of the differences, env by env, from PD with the same policy and with the base.
 Where the answer is no, the measures that are not named are better."""
@@ -116,6 +116,7 @@ def any_direction(book: Book) -> None:
 def stance(book: Book) -> None:
     """Where ours differs in stance."""
     pd, k100 = key("stance", PD), key("stance", "K 100")
+    book.run("calm-cotap", "cotap", "impact", *arms(book.robot)["K 100"], *CALM)
     book.paragraph(
         STANCE,
         paper=the_paper(book),

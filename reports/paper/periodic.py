@@ -25,7 +25,9 @@ def periodic(book: Book) -> None:
     from cotap.evaluation.periodic import PeriodicLoad
 
     book.add("", "## Periodic load (the paper's Fig. 7)")
-    book.paragraph("30 N in z with a period of 4 s on both hands; left arm alpha 0.7 with K_ee 500, right arm PD.")
+    book.paragraph(
+        "30 N in z with a period of 4 s on both hands, arms held; left arm alpha 0.7 with K_ee 500, right arm PD."
+    )
     book.table("", "left", "right", "left over right", book.paper)
     result = book.run("periodic", "cotap", "periodic-load", "--left", LEFT, "--right", "pd")
     for title, measure, digits, paper in ROWS:

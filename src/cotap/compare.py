@@ -60,8 +60,10 @@ def read(path: str) -> dict[str, Any]:
         raise ValueError(f"{path!r} {error}") from error
     except (ValueError, RecursionError) as error:  # not JSON, or nested without end
         raise ValueError(f"{path!r} is not JSON: {error}") from error
-    if not isinstance(content, dict) or not {"protocol", "metrics", "settings"} <= content.keys():
-        raise ValueError(f"{path!r} is not an evaluation: it lacks protocol, metrics or settings")
+    if not isinstance(content, dict) or not {"protocol", "settings"} <= content.keys():
+        raise ValueError(f"{path!r} is not an evaluation: it lacks protocol or settings")
+    if "metrics" not in content:
+        raise ValueError(f"{path!r}: {quoted(content['protocol'])} has no measures to compare")
     for part in ("metrics", "metrics_without_falls", "settings"):
         if not isinstance(content.get(part, {}), dict):
             raise ValueError(f"{path!r}: {part} must be an object, got {type(content[part]).__name__}")
@@ -115,6 +117,8 @@ def compare(a: dict[str, Any], b: dict[str, Any], without_falls: bool = False) -
         raise ValueError(f"protocols differ: {quoted(a['protocol'])} and {quoted(b['protocol'])}")
     key = "metrics_without_falls" if without_falls else "metrics"
     names = [name for name in a.get(key, {}) if name in b.get(key, {})]
+    if not names:
+        raise ValueError(f"the evaluations have no measure in common in {key}")
     rows = {name: judged(name, measure_difference(a, b, name, without_falls)) for name in names}
     old, new = (_flat(x["settings"] | {"method": x.get("method"), "window": x.get("window")}) for x in (a, b))
     settings = {

@@ -267,7 +267,6 @@ def test_the_command_writes_what_was_asked_for(protocol, checkpoint, tmp_path, c
     assert {"e_torso", "e_ee", "e_ee_hit", "j_upper", "e_upper", "recovery_s"} <= result["metrics"].keys()
     assert result["window"] == ({"start": 1.0, "end": 2.0} if protocol == "impact" else {"start": 3.0, "end": 5.0})
     assert result["metrics_without_falls"].keys() == result["metrics"].keys()
-    assert result["episode"]["metrics"]["j_upper"]["n"] == 16
     assert sum(result["falls"].values()) == result["num_falls"]
     assert result["arms"] == ("moving" if protocol == "impact" else "held")
     assert (tmp_path / "plot.png").stat().st_size > 5000

@@ -127,12 +127,14 @@ def test_the_tour_is_filmed_with_the_arms_as_they_were_evaluated(
     tmp_path: Path, checkpoint: Path, monkeypatch: pytest.MonkeyPatch
 ):
     filmed = []
-    monkeypatch.setattr("cotap.evaluation.render.tour_video", lambda *args: filmed.append(args[-1]))
+    monkeypatch.setattr("cotap.evaluation.render.tour_video", lambda *args: filmed.append(args[-2:]))
     options = ("--num-envs", "2", "--episode-seconds", "5", "--video", str(tmp_path / "tour.mp4"))
     run(tmp_path, checkpoint, *options)
     run(tmp_path, checkpoint, *options, "--motion", "none", "--arm-pose", "0.1", "0.2", "0.3", "0.4")
-    assert filmed[0] is None
-    assert filmed[1].tolist() == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.1, -0.2, -0.3, 0.4])
+    run(tmp_path, checkpoint, *options, "--upper-actions", "reference")
+    assert filmed[0] == (None, "policy")
+    assert filmed[2] == (None, "reference")
+    assert filmed[1][0].tolist() == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.1, -0.2, -0.3, 0.4])
 
 
 @pytest.mark.slow

@@ -12,12 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from test_retarget import upper_arm_rotation
 
 from cotap.motions import MotionClip, MotionError, MotionLibrary
 from cotap.motions.formats import FORMATS, detect_format
 from cotap.motions.importer import import_motions
 from cotap.motions.joblib_files import load_joblib
-from cotap.motions.retarget import arm_frames, upper_arm_rotation
+from cotap.motions.retarget import arm_frames
 
 SECONDS = 3.0
 Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # y up to z up

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from cotap.motions.quality import forward_kinematics
 from cotap.motions.retarget import (
+    ArmFrames,
     HumanMotion,
     arm_direction,
     arm_frames,
@@ -14,7 +16,6 @@ from cotap.motions.retarget import (
     elbow_angle,
     retarget,
     shoulder_angles,
-    upper_arm_rotation,
 )
 from cotap.robots import ROBOTS
 
@@ -29,6 +30,12 @@ def wave(seed: int, low, high, steps: int = T) -> np.ndarray:
     phase = rng.uniform(0, 2 * np.pi, (1, len(low)))
     t = np.linspace(0.0, 4.0, steps)[:, None]
     return (low + high) / 2 + (high - low) / 2 * np.sin(rng.uniform(0.5, 1.5, (1, len(low))) * t + phase)
+
+
+def upper_arm_rotation(frames: ArmFrames, q: np.ndarray) -> np.ndarray:
+    """(T, 3, 3) upper arm in the chest frame for shoulder angles `q` (T, >= 3): Rx(tilt) Ry Rx(roll - tilt) Rz."""
+    turns = Rotation.from_euler("YXZ", q[:, :3] - [0.0, frames.tilt, 0.0])  # each about the axis that was turned
+    return (Rotation.from_euler("X", frames.tilt) * turns).as_matrix()
 
 
 @pytest.mark.parametrize("index", [0, 1])

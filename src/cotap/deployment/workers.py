@@ -33,7 +33,6 @@ class Workers:
 
     def __init__(self, path: Path, jobs: int) -> None:
         require_range("jobs", jobs, 1, 1024)
-        self._path = path
         self._pool: Executor | None = None
         if jobs > 1:
             # Spawned, not forked: torch's threads do not survive a fork.

@@ -112,17 +112,11 @@ class Impact(Scenario):
             window["impedance_error"] = impedance_error(window, self.force, commanded)
         fall_end = onset + round(self.fall_seconds / t.dt)
         window["fall_fraction"] = t.fell[:fall_end].any(0)
-        episode = window_measures(t, 0, len(t.fell), hit)
         return {
             "falls": falls_by_time(t, onset, fall_end),
             "metrics": summaries(window, everyone, self.seed),
             "metrics_without_falls": summaries(window, stood, self.seed),
             "window": {"start": self.onset + self.window[0], "end": self.onset + self.window[1]},
-            "episode": {
-                "metrics": summaries(episode, everyone, self.seed),
-                "metrics_without_falls": summaries(episode, stood, self.seed),
-                "window": {"start": 0.0, "end": self.seconds},
-            },
             "curve": curve(t, onset, hit),
             **({"per_env": per_env_figures(window, stood)} if self.per_env else {}),
         } | self._stiffness(env, window, stood)
@@ -136,7 +130,11 @@ class Impact(Scenario):
         return "the force's direction differs between envs" if self.random_direction else ""
 
     def _commanded(self, env: HumanoidEnv) -> list[float] | None:
-        """Stiffness [N/m] of the first hand that the force is on; None under a law that commands none."""
+        """Stiffness [N/m] of the first hand that the force is on; None under a law that commands none, and where the
+        policy sets it."""
+        modulation = env.cfg.upper_body.modulation
+        if modulation.kind != "none" and not modulation.held:
+            return None
         law = env.cfg.upper_body.of(env.spec.arms[self.hit(env)[0]].side)
         return list(law.stiffness) if law.name not in WITHOUT_STIFFNESS else None
 

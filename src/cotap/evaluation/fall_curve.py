@@ -105,7 +105,9 @@ def curve_points(result: dict[str, Any]) -> list[tuple[float, float, float, floa
 
 def draw_fall_curve(axis: Any, result: dict[str, Any], color: str, label: str) -> None:
     """Add one result's curve to a matplotlib axis."""
-    x, mean, low, high = zip(*curve_points(result), strict=True)
+    if not (points := curve_points(result)):
+        return
+    x, mean, low, high = zip(*points, strict=True)
     axis.plot(x, mean, "o-", color=color, ms=3, label=label)
     axis.fill_between(x, low, high, color=color, alpha=0.2, lw=0)
 
@@ -126,6 +128,8 @@ def half_point(
     """
     found = _crossing(impulse, level, fell)
     if found is None:
+        if not len(level):
+            return {"mean": None, "ci95": None, "reason": "no env stood until the push"}
         low = bool(fell[level == 0].float().mean() >= 0.5) if (level == 0).any() else False
         reason = "half or more fall without a push" if low else f"fewer than half fall at {float(impulse[-1]):g} N s"
         return {"mean": None, "ci95": None, "reason": reason}

@@ -86,9 +86,10 @@ class Modulation(ConstantLoad):
         result = super().measure(trajectory, env) | {
             "effective_stiffness": {"commanded": None, "measured": None, "reason": "stiffness changes all the time"}
         }
-        # Nor does the hand come to a rest that it could overshoot.
+        # Nor is there one stiffness to err from, or a rest to overshoot.
         for measures in (result["metrics"], result["metrics_without_falls"]):
-            measures.pop("load_overshoot", None)
+            for name in ("impedance_error", "load_overshoot"):
+                measures.pop(name, None)
         if self.change == "both":
             steps = torch.arange(env.num_envs) % 2 == 0
             onset = round(self.onset / trajectory.dt)

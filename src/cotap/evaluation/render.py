@@ -16,7 +16,7 @@ from cotap.agents.actors import as_dict
 from cotap.checks import reason_of
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.evaluation.ray_renderer import RayRenderer
-from cotap.evaluation.rollout import PolicyFunction
+from cotap.evaluation.rollout import PolicyFunction, acting
 from cotap.evaluation.undisturbed import disable_disturbances
 from cotap.files import write_atomically
 from cotap.robots import RobotSpec
@@ -177,16 +177,18 @@ def contact_sheet(path: Path, frames: list[np.ndarray], columns: int) -> None:
 
 
 def record_tour(
-    cfg: HumanoidEnvConfig, policy: PolicyFunction, arm_pose: torch.Tensor | None = None, seed: int = 0
-) -> tuple[HumanoidEnv, torch.Tensor]:
-    """One nominal robot on the tour, its arms held at `arm_pose` (U,) if there is one. Returns the environment and its
-    `qpos` (T, nq) at every control step."""
+    cfg: HumanoidEnvConfig, policy: PolicyFunction, arm_pose: torch.Tensor | None = None, seed: int = 0,
+    upper_actions: str = "policy",
+) -> tuple[HumanoidEnv, torch.Tensor]:  # fmt: skip
+    """One nominal robot on the tour, its arms held at `arm_pose` (U,) if there is one; `upper_actions` as `acting` has
+    them. Returns the environment and its `qpos` (T, nq) at every control step."""
     disable_disturbances(cfg)
     cfg.num_envs, cfg.seed, cfg.backend = 1, seed, "mujoco"
     cfg.terminations.episode_s = 1e4
     env = HumanoidEnv(cfg)
     if arm_pose is not None:
         env.motions.hold(arm_pose)
+    act = acting(env, policy, upper_actions)
     rows: list[torch.Tensor] = []
     nominal = env.spec.nominal_height_m
     obs = env.get_observations()
@@ -195,16 +197,16 @@ def record_tour(
             torch.tensor([[vx, vy]]), torch.tensor([yaw]), torch.tensor([stand]), torch.tensor([nominal + offset])
         )
         for _ in range(round(seconds / env.dt)):
-            obs, _, _, _ = env.step(policy(as_dict(obs)))
+            obs, _, _, _ = env.step(act(as_dict(obs)))
             rows.append(env.sim.qpos[0].clone())
     return env, torch.stack(rows)
 
 
 def tour_video(
     path: Path, cfg: HumanoidEnvConfig, policy: PolicyFunction, sheet: Path | None = None,
-    arm_pose: torch.Tensor | None = None,
+    arm_pose: torch.Tensor | None = None, upper_actions: str = "policy",
 ) -> None:  # fmt: skip
     """Write a video (and a contact sheet) of the tour; see `record_tour`."""
-    env, qpos = record_tour(cfg, policy, arm_pose)
+    env, qpos = record_tour(cfg, policy, arm_pose, upper_actions=upper_actions)
     part = qpos[::STRIDE]
     write_film(path, render_frames(env.spec, part), len(part), env.dt, sheet)

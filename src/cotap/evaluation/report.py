@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,8 @@ UNITS = {
     "displacement_x": "m", "displacement_y": "m", "displacement_z": "m",
     "impedance_error": "m", "free_hand_error": "m", "loaded_hand_error": "m", "push_resistance": "N",
     "survival_s": "s", "position_error": "m", "yaw_error": "rad", "vibration": "rad/s^2", "j_upper_blow": "Nm",
+    "elbow_amplitude": "Nm", "elbow_rms": "Nm", "elbow_peak": "Nm", "arm_rms": "Nm", "hand_swing": "m",
+    "stiffness": "N/m",
 }  # fmt: skip
 
 LESS_IS_BETTER = (
@@ -40,6 +43,12 @@ def better(measure: str) -> str:
     """`less` or `more`, whichever of a measure is better; empty if neither is."""
     name = measure.removeprefix("force_")  # what a recording has of the time after its first force
     return "less" if name in LESS_IS_BETTER else "more" if name in MORE_IS_BETTER else ""
+
+
+def unit(measure: str) -> str:
+    """A measure's unit, also of one side alone, by statics, or after a recording's first force; empty without one."""
+    name = re.sub("^force_|(_static)?_(left|right)$", "", measure)
+    return UNITS.get(name, "")
 
 
 def require_outputs(json: str, plot: str, video: str) -> None:
@@ -77,7 +86,7 @@ def table(result: dict[str, Any]) -> str:
             lines.append(f"| {name} | - | - | {m['reason']} | |")
             continue
         low, high = m["ci95"]
-        lines.append(f"| {name} | {m['mean']:.4f} | {m['std']:.4f} | {low:.4f} to {high:.4f} | {UNITS.get(name, '')} |")
+        lines.append(f"| {name} | {m['mean']:.4f} | {m['std']:.4f} | {low:.4f} to {high:.4f} | {unit(name)} |")
     for name, value in result.get("slopes", {}).items():
         lines.append(f"| {name} | {'-' if value is None else f'{value:.3f}'} | | | |")
     falls = f"{result['num_falls']} of {result['num_envs']} envs fell"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -125,9 +125,11 @@ class StaticResult:
     saturated: bool
     """Whether an arm joint was at its torque limit at the end."""
     num_falls: int
-    spread: torch.Tensor = field(default_factory=lambda: torch.zeros(0))
-    """(L, 3) standard deviation over envs [m]."""
-    film: torch.Tensor = field(default_factory=lambda: torch.zeros(0, 0))
+    spread: torch.Tensor
+    """(L, 3) standard deviation over those envs [m]; zero of fewer than two."""
+    standing: torch.Tensor
+    """(L,) how many they are."""
+    film: torch.Tensor
     """Of the first env, as `Trajectory` has it."""
 
     def effective_stiffness(self) -> list[float | None]:
@@ -194,15 +196,16 @@ def measure(env: HumanoidEnv, protocol: StaticStiffness, policy: PolicyFunction)
     side = [arm.side for arm in env.spec.arms].index(protocol.hand)
     settled = settle(env, acting(env, policy, protocol.upper_actions), protocol.settle_seconds, side)
     level = torch.arange(env.num_envs) % protocol.levels
-    means, spreads = [], []
+    means, spreads, counts = [], [], []
     for i in range(protocol.levels):
         standing = settled.moved[(level == i) & ~settled.fell]
         means.append(standing.mean(0) if len(standing) else torch.full((3,), math.nan))
         spreads.append(standing.std(0) if len(standing) > 1 else torch.zeros(3))
+        counts.append(len(standing))
     return StaticResult(
         env.forces.scripted.amplitude_h[: protocol.levels, side].cpu(), torch.stack(means),
         float(settled.condition.mean()), bool(settled.saturated.any()), int(settled.fell.sum()), torch.stack(spreads),
-        settled.film,
+        torch.tensor(counts), settled.film,
     )  # fmt: skip
 
 
@@ -221,6 +224,7 @@ def summary(result: StaticResult, commanded: tuple[float, ...] | None) -> dict[s
             "force": result.force.tolist(),
             "displacement": [[None if math.isnan(v) else v for v in row] for row in result.displacement.tolist()],
             "spread": result.spread.tolist(),
+            "standing": result.standing.tolist(),
         },
     }
 

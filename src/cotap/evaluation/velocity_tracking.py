@@ -108,4 +108,4 @@ class VelocityTracking(RolloutProtocol):
         from cotap.evaluation.render import tour_video
 
         pose = mirrored_pose(env, self.arm_pose) if self.arms == "held" else None
-        tour_video(path, copy.deepcopy(env.cfg), policy, sheet, pose)
+        tour_video(path, copy.deepcopy(env.cfg), policy, sheet, pose, self.upper_actions)

@@ -66,20 +66,6 @@ def _about_x(angle: float) -> np.ndarray:
     return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
 
 
-def upper_arm_rotation(frames: ArmFrames, q: np.ndarray) -> np.ndarray:
-    """(T, 3, 3) upper arm in the chest frame for shoulder angles `q` (T, >= 3): what `shoulder_angles` inverts."""
-    (cp, cr, cy), (sp, sr, sy) = (f((q[:, :3] - [0.0, frames.tilt, 0.0]).T) for f in (np.cos, np.sin))
-    zero, one = np.zeros_like(cp), np.ones_like(cp)
-
-    def stack(*rows: list[np.ndarray]) -> np.ndarray:
-        return np.stack([np.stack(r, -1) for r in rows], -2)
-
-    pitch = stack([cp, zero, sp], [zero, one, zero], [-sp, zero, cp])
-    roll = stack([one, zero, zero], [zero, cr, -sr], [zero, sr, cr])
-    yaw = stack([cy, -sy, zero], [sy, cy, zero], [zero, zero, one])
-    return _about_x(frames.tilt) @ pitch @ roll @ yaw
-
-
 def shoulder_angles(frames: ArmFrames, rotation: np.ndarray) -> np.ndarray:
     """Both solutions (2, T, 3) of pitch, roll and yaw for upper arm rotations (T, 3, 3), wrapped towards the limits.
 
