@@ -39,7 +39,7 @@ def test_weights_provenance_and_evaluations_are_written(
     assert before["learner"]
     assert before["env"]
     assert after["learner"] == after["env"] == {}
-    assert not {"rng", "device_rng", "infos"} & after.keys()
+    assert not {"rng", "device_rng"} & after.keys()
     for key, value in before["model"].items():
         assert torch.equal(after["model"][key], value), key
     assert load_policy(package / f"{name}.pt").stage == stage

@@ -19,7 +19,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from cotap import pipeline, train
 from cotap.agents.checkpoint import load_checkpoint, save_checkpoint
 from cotap.agents.runner import sole_writer
-from cotap.configs import BASE_RECIPES, DISTILL_RECIPES, BaseTraining, from_plain
+from cotap.configs import BASE_RECIPES, DISTILL_RECIPES, BaseTraining, from_plain, to_plain
 from cotap.envs import HumanoidEnv
 from cotap.envs.rewards import LowerRewards, UpperRewards
 from cotap.evaluation import policy
@@ -320,6 +320,18 @@ def test_resume_auto_begins_where_there_is_nothing_and_goes_on_where_there_is(tm
     assert (second["iteration"], second["config"]["training"]["ppo"]["gamma"]) == (3, 0.9)
 
 
+@pytest.mark.parametrize("stage", ["base", "distill"])
+def test_one_command_with_a_recipe_begins_a_run_and_goes_on_with_it(checkpoint: Path, tmp_path: Path, stage: str):
+    """As a scheduler that starts a job again would type it."""
+    first = [BASE_CHECKPOINT, checkpoint] if stage == "distill" else []
+    command = [stage, RECIPE, "facet", *first, *SMALL, RUN_DIR, tmp_path / "run", RESUME, "auto"]
+    assert run(*command, ITERATIONS, 1) == 0
+    assert run(*command, ITERATIONS, 2) == 0
+    content = newest(tmp_path / "run")
+    assert content["iteration"] == 2
+    assert content["config"]["training"]["env"]["rewards"]["upper"]["track_hands_as_facet"] == 1.3
+
+
 def test_resume_auto_begins_again_in_the_folder_of_a_run_without_checkpoints(tmp_path: Path):
     (tmp_path / "config.json").write_text("{}")
     assert run_small(tmp_path, RESUME, "auto")["iteration"] == 2
@@ -514,19 +526,23 @@ def test_an_ablation_begins_from_a_base_that_saw_something_else(
 @pytest.mark.parametrize("recipe", DISTILL_RECIPES)
 def test_every_recipe_distils(checkpoint: Path, tmp_path: Path, recipe: str):
     content = distill(tmp_path / "run", checkpoint, RECIPE, recipe)
-    kept = from_plain(BaseTraining, load_checkpoint(checkpoint)["config"]["training"])
+    base = load_checkpoint(checkpoint)
+    kept = from_plain(BaseTraining, base["config"]["training"])
+    kept.train_for(base["samples"])
     expected = DISTILL_RECIPES[recipe](kept)
     training = from_plain(type(expected), content["config"]["training"])
     assert training.env.upper_body == expected.env.upper_body
     assert training.env.rewards == expected.env.rewards
     assert training.env.observations == expected.env.observations
+    assert training.ppo.initial_std == expected.ppo.initial_std
 
 
 def test_distilling_from_a_distilled_policy_is_refused(
     checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    path = checkpoint.with_name("distilled.pt")
-    save_checkpoint(path, load_checkpoint(checkpoint) | {"kind": "distill"})
+    path, content = checkpoint.with_name("distilled.pt"), load_checkpoint(checkpoint)
+    distilled = to_plain(DISTILL_RECIPES["default"](BaseTraining()))
+    save_checkpoint(path, content | {"kind": "distill", "config": content["config"] | {"training": distilled}})
     before = tree(tmp_path)
     assert run("distill", BASE_CHECKPOINT, path, RUN_DIR, tmp_path / "run", ENVS, 8) == 2
     assert "is of stage 'distill', not 'base'" in capsys.readouterr().err
@@ -639,9 +655,9 @@ def test_the_quick_pipeline_is_a_small_version_of_both(tmp_path: Path, monkeypat
 
 
 @pytest.mark.slow
-def test_the_pipelines_first_stage_may_have_another_recipe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_recipe_is_that_of_both_stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     tiny_networks(monkeypatch)
-    assert run("--base-recipe", "facet", *BOTH, RUN_DIR, tmp_path) == 0
+    assert run("--recipe", "facet", *BOTH, RUN_DIR, tmp_path) == 0
     for stage in ("base", "distill"):
         rewards = newest(tmp_path / stage)["config"]["training"]["env"]["rewards"]["upper"]
         assert (rewards["track_hands_as_facet"], rewards["track_key_points"]) == (1.3, 0.0)
@@ -653,8 +669,8 @@ def test_the_pipelines_first_stage_may_have_another_recipe(tmp_path: Path, monke
         ([ENVS, 0], "num_envs"),
         (["--base-iterations", -1], "base_iterations"),
         ([THREADS, -1], "threads"),
-        (["--base-recipe", "fast"], "default, facet, paper, quick"),
-        (["--quick", "--base-recipe", "paper"], "--base-recipe 'paper'"),
+        (["--recipe", "goals"], "default, facet, paper, quick"),
+        (["--quick", "--recipe", "paper"], "--recipe 'paper'"),
     ],
 )
 def test_bad_options_of_both_stages_are_named(options: list[Any], needle: str, capsys: pytest.CaptureFixture[str]):

@@ -27,8 +27,8 @@ class PipelineOptions:
     """Name of the robot."""
     quick: bool = False
     """A small version of both stages. Walking is trained without loads and pushes, compliance only begun."""
-    base_recipe: str = ""
-    """Recipe of stage 1. Without it, default, or quick with --quick."""
+    recipe: str = ""
+    """Recipe of both stages: default, quick, paper or facet. Without it, default, or quick with --quick."""
     resume: bool = False
     """Go on with the runs in --run-dir. A stage that is finished is not run again."""
     num_envs: int = 1024
@@ -54,20 +54,17 @@ class PipelineOptions:
             require_range(name, getattr(self, name), 0, 1e9)
         require_range("threads", self.threads, 0, 4096)
         resolve_backend(self.backend)
-        if self.base_recipe:
-            require_one_of("base_recipe", self.base_recipe, BASE_RECIPES.keys())
+        if self.recipe:
+            require_one_of("recipe", self.recipe, BASE_RECIPES.keys() & DISTILL_RECIPES.keys())
             if self.quick:
-                raise ValueError(
-                    f"--quick has its own recipe of stage 1, so --base-recipe {self.base_recipe!r} is not allowed"
-                )
+                raise ValueError(f"--quick is a recipe, so --recipe {self.recipe!r} is not allowed")
         if self.resume and not self.run_dir:
             raise ValueError("--resume goes on with the runs in --run-dir, which is not given")
 
     @property
-    def recipes(self) -> tuple[str, str]:
-        """Of both stages, by name."""
-        both = "quick" if self.quick else "default"
-        return self.base_recipe or both, both
+    def chosen(self) -> str:
+        """Name of the recipe."""
+        return self.recipe or ("quick" if self.quick else "default")
 
     def iterations(self) -> tuple[int, int]:
         """Of both stages."""
@@ -76,13 +73,12 @@ class PipelineOptions:
 
     def _trainings(self) -> tuple[BaseTraining, DistillTraining]:
         """Both configurations."""
-        first, second = self.recipes
-        base = BASE_RECIPES[first]()
+        base = BASE_RECIPES[self.chosen]()
         samples = base.runner.iterations * base.ppo.steps * base.env.num_envs
         base.env.robot, base.env.num_envs, base.env.backend = self.robot, self.num_envs, self.backend
         base.env.num_threads = self.threads
         base.train_for(samples)  # whatever the number of envs
-        distill = DISTILL_RECIPES[second](base)
+        distill = DISTILL_RECIPES[self.chosen](base)
         base.runner.iterations = self.base_iterations or base.runner.iterations
         distill.runner.iterations = self.distill_iterations or distill.runner.iterations
         return base, distill
@@ -112,11 +108,9 @@ def train_both(options: PipelineOptions, run_stage: RunStage) -> Path:
     base_steps, distill_steps = options.iterations()
     if not options.resume:
         print(expected(options), flush=True)
-    first, second = options.recipes
-    begin = ["--recipe", first, "--robot", options.robot]
-    base = _part(options, run_dir / "base", base_steps, begin, run_stage)
-    begin = ["--recipe", second, "--base-checkpoint", str(base)]
-    _part(options, run_dir / "distill", distill_steps, begin, run_stage)
+    recipe = ["--recipe", options.chosen]
+    base = _part(options, run_dir / "base", base_steps, [*recipe, "--robot", options.robot], run_stage)
+    _part(options, run_dir / "distill", distill_steps, [*recipe, "--base-checkpoint", str(base)], run_stage)
     print(_summary(run_dir), end="")
     return run_dir
 

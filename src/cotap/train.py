@@ -26,7 +26,6 @@ from cotap.checks import quoted, reason_of, require_one_of, shortened
 from cotap.configs import (
     BASE_RECIPES,
     DISTILL_RECIPES,
-    OTHER_TERMS,
     BaseTraining,
     DistillTraining,
     from_plain,
@@ -83,8 +82,8 @@ class DistillOptions:
     recipe: str = "default"
     """default, quick, paper, facet, modulated, no-ratio, torque-critic or goals. default: 80 to 1200 N/m. quick: a
     short default. paper: 150 to 450 N/m. facet: arms under FACET, with its tracking reward. modulated: the policy sets
-    alpha and stiffness. The others are ablations. The last two and modulated change what the networks see or do, and
-    the networks of the base are refitted."""
+    alpha and stiffness. The others are ablations. Where networks see or do something else than the base's, those are
+    refitted."""
     command: tyro.conf.Suppress[str] = ""
     training: Annotated[DistillTraining, tyro.conf.arg(name="")] = field(default_factory=DistillTraining)
 
@@ -155,11 +154,12 @@ def _named(key: str) -> str:
 
 def _parse_base(args: list[str]) -> BaseOptions:
     """Options on top of the resumed checkpoint's config, or else of the recipe's."""
+    goes_on = _resumes_newest(args)  # with whatever the run began with
     args = _expand(args)
     recipe, resumed = _peek(args, "--recipe"), _peek(args, "--resume")
     require_one_of("recipe", recipe or "default", BASE_RECIPES.keys())
     if resumed:
-        training = _resumed_config(resumed, recipe, "base", BaseTraining)
+        training = _resumed_config(resumed, "" if goes_on else recipe, "base", BaseTraining)
     else:
         training = BASE_RECIPES[recipe or "default"]()
     _unpin_library(args, training)
@@ -171,18 +171,18 @@ def _parse_distill(args: list[str]) -> DistillOptions:
     """Options on top of the resumed checkpoint's config, or else of what the recipe makes of the base's."""
     from cotap.evaluation.policy import shipped_checkpoint
 
-    begins = _resumes_newest(args)  # from that base, unless it has begun
+    goes_on = _resumes_newest(args)  # with whatever the run began with
     args = _expand(args)
     given, resumed, base = (_peek(args, option) for option in ("--recipe", "--resume", "--base-checkpoint"))
     recipe = require_one_of("recipe", given or "default", DISTILL_RECIPES.keys())
     if resumed:
-        training = _resumed_config(resumed, given, "distill", DistillTraining)
-        if base and not begins:
+        training = _resumed_config(resumed, "" if goes_on else given, "distill", DistillTraining)
+        if base and not goes_on:
             raise ValueError(f"--base-checkpoint {base!r}: checkpoint {resumed!r} brings the base that guides it")
         base = ""
     else:
         base = base or str(shipped_checkpoint("h1-base"))
-        training = DISTILL_RECIPES[recipe](_config_of(base, BaseTraining))
+        training = DISTILL_RECIPES[recipe](_base_config(base))
     _unpin_library(args, training)
     default = DistillOptions(recipe=recipe, base_checkpoint=base, training=training)
     return tyro.cli(DistillOptions, args=args, default=default, prog="cotap train distill")
@@ -209,6 +209,19 @@ def _resumed_config(checkpoint: str, recipe: str, stage: str, kind: type[Any]) -
     if recipe:
         raise ValueError(f"--recipe {recipe!r}: the run of --resume goes on with its own config")
     return _config_of(checkpoint, kind)
+
+
+def _base_config(checkpoint: str) -> BaseTraining:
+    """The config of a base policy, for as many samples as it was trained on. Raises CheckpointError for another one."""
+    from cotap.agents.checkpoint import CheckpointError, load_checkpoint, require_parts
+
+    content = load_checkpoint(checkpoint)
+    require_parts(checkpoint, content, ("kind", "layout", "model", "samples"))
+    if content["kind"] != "base":
+        raise CheckpointError(f"checkpoint {checkpoint!r} is of stage {quoted(content['kind'])}, not 'base'")
+    training = _config_of(checkpoint, BaseTraining)
+    training.train_for(content["samples"])
+    return training
 
 
 def _config_of(checkpoint: str, kind: type[Any]) -> Any:
@@ -241,19 +254,11 @@ def train_distill(options: DistillOptions) -> Path:
     """Run stage 2. Returns the run directory.
 
     Raises:
-        CheckpointError: the base checkpoint cannot be used, is not of stage 1, or has other networks.
+        CheckpointError: the base checkpoint cannot be used, or has other networks.
     """
-    from cotap.agents.checkpoint import CheckpointError, load_checkpoint, require_parts
+    from cotap.agents.checkpoint import load_checkpoint
 
-    base = None
-    if options.base_checkpoint:
-        base = load_checkpoint(options.base_checkpoint)
-        require_parts(options.base_checkpoint, base, ("kind", "layout", "model"))
-        if base["kind"] != "base":
-            raise CheckpointError(
-                f"checkpoint {options.base_checkpoint!r} is of stage {quoted(base['kind'])}, not 'base'"
-            )
-    return _train("distill", options, base)
+    return _train("distill", options, load_checkpoint(options.base_checkpoint) if options.base_checkpoint else None)
 
 
 def _train(stage: str, options: BaseOptions | DistillOptions, base: dict[str, Any] | None) -> Path:
@@ -298,7 +303,7 @@ def _train(stage: str, options: BaseOptions | DistillOptions, base: dict[str, An
         if ranks.leads:
             check_run_dir(run_dir, resumed if resumed_dir else None)
         with sole_writer(run_dir) if ranks.leads else contextlib.nullcontext():
-            runner.learn(init_at_random_ep_len=True)
+            runner.learn()
     if ranks.leads:
         say(f"{runner.current_learning_iteration} iterations, {runner.wall_seconds:.0f} s: {run_dir}")
     return run_dir
@@ -330,13 +335,13 @@ def _guide(env: Any, options: DistillOptions, base: dict[str, Any] | None) -> An
     from cotap.agents.actors import DualActorCritic
     from cotap.agents.distillation import Guide
     from cotap.agents.refit import REFITTED, take_over
+    from cotap.agents.run_log import say
     from cotap.agents.runner import layout_of
 
     training = options.training
     model = DualActorCritic(layout_of(env, training.ppo.symmetric), training.ppo.hidden, training.ppo.initial_std)
-    if base is not None:
-        acts_otherwise = options.recipe in OTHER_TERMS or training.env.upper_body.modulation.kind != "none"
-        take_over(options.base_checkpoint, base, model, env, REFITTED if acts_otherwise else ("critic_terms",))
+    if base is not None and take_over(options.base_checkpoint, base, model, env, REFITTED):
+        say("the networks see or do something else than the base's, which were refitted to that")
     return Guide(model.to(training.device), training.distillation)
 
 
@@ -344,6 +349,8 @@ def provenance(command: str, backend: str) -> dict[str, str]:
     """What else a run should remember: the code it ran, the command, the machine, what simulated."""
     try:
         git = ["git", "-C", str(Path(__file__).parent)]
+        # Fails where the package lies in another project's repository, whose commit says nothing of it.
+        subprocess.run([*git, "ls-files", "--error-unmatch", Path(__file__).name], capture_output=True, check=True)
         commit = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True).stdout.strip()
         dirty = subprocess.run([*git, "status", "--porcelain", "."], capture_output=True, text=True, check=True).stdout
         commit += " with local changes" if dirty.strip() else ""

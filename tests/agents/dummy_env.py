@@ -114,4 +114,4 @@ if __name__ == "__main__":  # RUN_DIR ITERATIONS SIGNAL STEP: train, and send on
     check_run_dir(folder)
     runner = make_runner(folder, count)
     runner.env.on_step = lambda step: os.kill(os.getpid(), signal.Signals(number)) if step == at else None
-    runner.learn(init_at_random_ep_len=True)
+    runner.learn()

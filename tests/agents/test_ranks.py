@@ -101,7 +101,7 @@ def train(ranks: Ranks, folder: Path, iterations: int, resume: int = 0, stop_at:
         runner.load(str(folder / f"checkpoint_{resume:06d}.pt"))
     if ranks.rank == 1:
         runner.env.on_step = lambda step: signal.raise_signal(signal.SIGTERM) if step == stop_at else None
-    runner.learn(init_at_random_ep_len=True)
+    runner.learn()
     return learned(runner), runner.env.x.tolist()
 
 
@@ -136,7 +136,7 @@ def lose(ranks: Ranks, folder: Path) -> str:
     if ranks.rank == 1:
         runner.env.on_step = lambda step: os.kill(os.getpid(), signal.SIGKILL) if step == 3 * STEPS + 2 else None
     try:
-        runner.learn(init_at_random_ep_len=True)
+        runner.learn()
     except TrainingFault as error:
         return str(error)
     return ""

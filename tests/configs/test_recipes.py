@@ -205,6 +205,17 @@ def test_a_distillation_begins_with_what_its_base_ended_with():
     assert training.ppo.initial_std == training.ppo.least_std
 
 
+def test_exploration_goes_on_from_where_a_base_that_stopped_early_left_it():
+    base = BASE_RECIPES["default"]()
+    base.train_for(base.ppo.std_half_life)
+    assert DISTILL_RECIPES["default"](base).ppo.initial_std == pytest.approx(base.ppo.initial_std / 2, rel=1e-3)
+
+
+def test_facets_reward_is_that_of_both_stages():
+    weights = DISTILL_RECIPES["facet"](BASE_RECIPES["facet"]()).env.rewards.upper
+    assert (weights.track_hands_as_facet, weights.track_key_points) == (1.3, 0.0)
+
+
 @pytest.mark.parametrize("num_envs", [512, 1024])
 @pytest.mark.parametrize(
     ("names", "samples"),

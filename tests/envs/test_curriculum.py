@@ -27,6 +27,7 @@ def test_a_ramp_by_hand(samples, share):
 
 def test_a_ramp_that_is_none_is_full_at_once():
     assert RampConfig().share(0) == 1.0
+    assert [RampConfig(100, 100, first=0.2).share(samples) for samples in (0, 99, 100)] == [0.2, 0.2, 1.0]  # a step
 
 
 @pytest.mark.parametrize(

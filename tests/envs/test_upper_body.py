@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from env_tools import NOMINAL, drive, knock_over, mujoco_of, zeros
 
-from cotap.compliance.laws import LawConfig
+from cotap.compliance.laws import LAWS, READS, LawConfig, PDLaw
 from cotap.envs.actions import ActionConfig
 from cotap.envs.external_forces import ExternalForceConfig
 from cotap.envs.randomization import RandomizationConfig
@@ -110,6 +111,29 @@ def test_arms_have_laws_of_their_own(make_env):
     assert set(mixed.upper_body.log) == {
         "/law/alpha", "/law/projected", "/law/smallest_eigenvalue", "/law/largest_eigenvalue"
     }  # fmt: skip
+
+
+class Anchored(PDLaw):
+    """PD as a spring that rests at the target: the same torque, said with another anchor."""
+
+    def __init__(self, arms, _config):
+        super().__init__(arms)
+
+    def __call__(self, arms, parameters):
+        answer, report = super().__call__(arms, parameters)
+        rest = answer.anchor + torch.linalg.solve(answer.stiffness, answer.elastic)
+        return replace(answer, anchor=rest, elastic=torch.zeros_like(answer.elastic)), report
+
+
+def test_each_arms_law_has_an_anchor_of_its_own(make_env, monkeypatch):
+    monkeypatch.setitem(LAWS, "anchored", Anchored)
+    monkeypatch.setitem(READS, "anchored", READS["pd"])
+    torques = []
+    for left in ("pd", "anchored"):
+        env = make_env(2, randomization=NOMINAL, upper_body=UpperBodyConfig(LawConfig(left), LawConfig("soft-pd")))
+        drive(env, 3)
+        torques.append(env.torque)
+    torch.testing.assert_close(*torques, rtol=1e-4, atol=1e-3)
 
 
 def test_parameters_differ_between_envs_and_may_change(make_env):

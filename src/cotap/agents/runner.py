@@ -15,7 +15,6 @@ from typing import Any
 import torch
 from filelock import FileLock, Timeout
 from rsl_rl.env import VecEnv
-from rsl_rl.runners import OnPolicyRunner
 from tqdm import tqdm
 
 from cotap.agents.actors import AgentLayout, Observations, as_dict
@@ -101,9 +100,9 @@ class TrainingFault(RuntimeError):
     """An iteration that could not be finished; the message says why, and what to go on from."""
 
 
-class DualRunner(OnPolicyRunner):
-    """rsl_rl's runner for two agents. Replaces its loop, its saving (all that a run depends on) and its loading
-    (no code is run from a file); needs an environment with `action_slices`, `obs_groups` and `state_dict`.
+class DualRunner:
+    """Trains two agents in an rsl_rl `VecEnv`, and saves all that the run depends on. The environment needs
+    `action_slices`, `obs_groups` and `state_dict`.
 
     Args:
         env: The environment.
@@ -132,8 +131,8 @@ class DualRunner(OnPolicyRunner):
         self._save_failed = self._stop = False
         self._kept: dict[str, Any] = {}
 
-    def learn(self, num_learning_iterations: int | None = None, init_at_random_ep_len: bool = False) -> None:
-        """Train up to `runner.iterations` in all (or for so many more), saving at intervals and at the end.
+    def learn(self) -> None:
+        """Train up to `runner.iterations` in all, saving at intervals and at the end.
 
         A save that fails (a full disk) is reported and tried again after every iteration; envs that diverge and
         steps that are skipped are reported as they are counted.
@@ -144,14 +143,13 @@ class DualRunner(OnPolicyRunner):
         """
         env, alg, ranks = self.env, self.alg, self.ranks
         self._stop = False
-        first = self.current_learning_iteration
-        last = self.runner_cfg.iterations if num_learning_iterations is None else first + num_learning_iterations
+        first, last = self.current_learning_iteration, self.runner_cfg.iterations
         if ranks.leads:
             remove_leftovers(self.run_dir)  # also of a run that was killed after its last save
         if first >= last:
             say(f"at iteration {first} of {last}: nothing to do; --iterations says how many in all")
             return
-        if init_at_random_ep_len and not env.episode_length_buf.any():
+        if not env.episode_length_buf.any():  # or else all envs would end at once
             env.episode_length_buf = torch.randint_like(env.episode_length_buf, high=int(env.max_episode_length))
         ranks.same_everywhere(alg.model)
         run_log = None
@@ -264,31 +262,27 @@ class DualRunner(OnPolicyRunner):
         if self._save_failed:
             self._saved = -1  # on every rank: those that have nothing to write must try along
 
-    def save(self, path: str | None = None, infos: dict | None = None) -> None:
+    def save(self, path: str = "") -> None:
         """Save everything to go on exactly; the previous checkpoint then sheds its simulator states."""
         if self.alg.guide:
             self.alg.guide.verify()
         target = Path(path) if path else self.run_dir / f"checkpoint_{self.current_learning_iteration:06d}.pt"
         others = self.ranks.gather(self._own_state)
         if self.ranks.leads:
-            save_checkpoint(target, self._content() | {"others": others, "infos": infos or {}})
+            save_checkpoint(target, self._content() | {"others": others})
             older = [path for path in self.run_dir.glob(CHECKPOINT_PATTERN) if path < target]
             if older:
                 _shed_simulator_states(max(older))
         self._saved = self.current_learning_iteration
 
-    def load(self, path: str, *_: Any, map_location: str | None = None, **__: Any) -> dict:
+    def load(self, path: str) -> None:
         """Load a checkpoint of a run. Simulator states that it lacks, or that are of another number of envs or ranks,
         or of other collisions, start afresh.
-
-        Args:
-            path: The file.
-            map_location: Where to load it to; by default where the networks live.
 
         Raises:
             CheckpointError: the file cannot be used, or was trained for another robot or observation layout.
         """
-        content = load_checkpoint(path, map_location or self.device)
+        content = load_checkpoint(path, self.device)
         require_parts(path, content, PARTS.keys() - {"agents", "kind"})
         env: Any = self.env
         take_over(path, content, self.alg.model, env)
@@ -309,7 +303,6 @@ class DualRunner(OnPolicyRunner):
             raise CheckpointError(
                 f"checkpoint {path!r} has states that do not fit this run: {reason_of(error)}"
             ) from error
-        return content.get("infos", {})
 
     def _share_of(self, content: dict[str, Any]) -> dict[str, Any]:
         """This rank's envs and random numbers in a checkpoint; none, if it is of another number of ranks."""

@@ -23,17 +23,19 @@ class TimedTraining:
 
     def __init__(self, env: VecEnv, ppo: DualPPOConfig, device: str = "cpu") -> None:
         self.env: Any = env
+        self.device = device
         self.alg = DualPPO(layout_of(env, ppo.symmetric), env.num_envs, ppo, device)
 
     def run(self) -> float:
         """Samples per second of one whole iteration, which collects and learns."""
-        alg, env = self.alg, self.env
+        alg, env, device = self.alg, self.env, self.device
         start = time.perf_counter()
-        obs = as_dict(env.get_observations())
+        obs = as_dict(env.get_observations(), device)
         for _ in range(alg.cfg.steps):
-            obs, _, dones, extras = env.step(alg.act(obs))
-            obs = as_dict(obs)
-            alg.process_step(extras["group_rewards"], dones, extras["time_outs"])
+            obs, _, dones, extras = env.step(alg.act(obs).to(env.device))
+            obs = as_dict(obs, device)
+            learned = (extras["group_rewards"], dones, extras["time_outs"])
+            alg.process_step(*(value.to(device) for value in learned))
         alg.compute_returns(obs)
         alg.update()
         return alg.cfg.steps * env.num_envs / (time.perf_counter() - start)

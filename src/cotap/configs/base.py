@@ -123,7 +123,7 @@ def facet() -> BaseTraining:
 
 def track_as_facet(weights: UpperRewards) -> None:
     """Put FACET's tracking reward of the hands in the place of that of key points, at their weight."""
-    weights.track_hands_as_facet = weights.track_key_points + weights.track_key_velocities
+    weights.track_hands_as_facet += weights.track_key_points + weights.track_key_velocities
     weights.track_key_points = weights.track_key_velocities = 0.0
 
 

@@ -137,6 +137,5 @@ DISTILL_RECIPES: dict[str, Callable[[BaseTraining], DistillTraining]] = {
     "facet": facet,
     "modulated": modulated,
 }
-"""Stage 2, by name."""
-OTHER_TERMS = ("torque-critic", "goals", "modulated")
-"""Recipes that change what networks see or do, and so refit those of the base that they begin from."""
+"""Stage 2, by name. Each makes its configuration of the base's, whose `runner.iterations` are those that it was trained
+for."""

@@ -39,8 +39,10 @@ class RampConfig:
         """The share after so many samples."""
         if samples >= self.full_samples:
             return 1.0
+        if samples <= self.start_samples:
+            return self.first
         progress = (samples - self.start_samples) / (self.full_samples - self.start_samples)
-        return self.first + (1.0 - self.first) * max(0.0, progress)
+        return self.first + (1.0 - self.first) * progress
 
 
 @dataclass

@@ -338,7 +338,7 @@ def _choose(mine: torch.Tensor, answer: TorqueLaw, other: TorqueLaw) -> TorqueLa
     """`answer` for the arms in `mine` (N, A), `other` for the rest."""
     vector, matrix = mine[..., None], mine[..., None, None]
     return TorqueLaw(
-        answer.anchor,
+        torch.where(vector, answer.anchor, other.anchor),
         torch.where(vector, answer.feedforward, other.feedforward),
         torch.where(vector, answer.elastic, other.elastic),
         torch.where(matrix, answer.stiffness, other.stiffness),
