@@ -194,6 +194,7 @@ def test_only_evaluations_of_the_same_policy_and_settings_are_kept(book, monkeyp
         ({"arguments": [*written["arguments"], "--seed", "1"]}, False),
     ):
         asked.clear()
+        book.results.clear()
         path.write_text(json.dumps(written | changed))
         book.run("row", "base", "impact", "--alpha", "0.5")
         assert (not asked) == kept
