@@ -10,7 +10,7 @@ import torch
 from cotap.compare import compare, difference, main, table
 from cotap.evaluation.metrics import summarize
 from cotap.evaluation.policy import shipped_checkpoint, shipped_names
-from cotap.evaluation.report import better
+from cotap.evaluation.report import better, unit
 
 
 def result(**metrics):
@@ -177,6 +177,22 @@ def test_files_that_are_no_evaluations_are_named(text, tmp_path, capsys):
     path.write_text(text)
     assert main([str(path), str(path)]) == 2
     assert "a.json" in capsys.readouterr().err
+
+
+def test_what_has_no_measure_in_common_is_not_compared(tmp_path, capsys):
+    for name, content in (("a", {"e_lin": summarize(torch.rand(9))}), ("b", {"e_yaw": summarize(torch.rand(9))})):
+        (tmp_path / name).write_text(json.dumps(result(**content)))
+    assert main([str(tmp_path / "a"), str(tmp_path / "b")]) == 2
+    assert "no measure in common" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("measure", "expected"),
+    [("elbow_amplitude_static_left", "Nm"), ("energy_right", "J"), ("force_e_ee", "m"), ("settled_fraction", ""),
+     ("elbow_rms_ratio", "")],
+)  # fmt: skip
+def test_a_measure_of_one_side_or_after_a_force_has_its_unit(measure, expected):
+    assert unit(measure) == expected
 
 
 def test_other_protocols_are_not_compared(tmp_path, capsys):

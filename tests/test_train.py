@@ -7,6 +7,7 @@ import math
 import os
 import re
 import signal
+import subprocess
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from cotap import pipeline, train
+from cotap import __version__, pipeline, train
 from cotap.agents.checkpoint import load_checkpoint, save_checkpoint
 from cotap.agents.runner import sole_writer
 from cotap.configs import BASE_RECIPES, DISTILL_RECIPES, BaseTraining, from_plain, to_plain
@@ -676,3 +677,21 @@ def test_a_recipe_is_that_of_both_stages(tmp_path: Path, monkeypatch: pytest.Mon
 def test_bad_options_of_both_stages_are_named(options: list[Any], needle: str, capsys: pytest.CaptureFixture[str]):
     assert run(*options) == 2
     assert needle in capsys.readouterr().err
+
+
+def test_a_commit_is_recorded_only_of_the_repository_that_the_package_is_part_of(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Installed into another project's folder, the package lies in that project's repository."""
+    git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b.c"]
+    (tmp_path / "train.py").write_text("")
+    (tmp_path / "own.py").write_text("")
+    subprocess.run([*git, "init", "-q"], check=True)
+    subprocess.run([*git, "add", "own.py"], check=True)
+    subprocess.run([*git, "commit", "-qm", "theirs"], check=True)
+    monkeypatch.setattr(train, "__file__", str(tmp_path / "train.py"))
+    assert train.provenance("", "mujoco")["commit"] == f"cotap {__version__}"
+    subprocess.run([*git, "add", "train.py"], check=True)
+    subprocess.run([*git, "commit", "-qm", "ours"], check=True)
+    head = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True).stdout.strip()
+    assert train.provenance("", "mujoco")["commit"] == head

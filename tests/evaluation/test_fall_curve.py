@@ -29,6 +29,11 @@ def test_half_point_by_hand():
     assert half_point(IMPULSES, level, fell)["mean"] == pytest.approx(27.5)
 
 
+def test_without_an_env_that_stood_until_the_push_there_is_no_half_point():
+    nobody = torch.zeros(0, dtype=torch.long)
+    assert half_point(IMPULSES, nobody, nobody.bool())["reason"] == "no env stood until the push"
+
+
 def test_the_interval_covers_the_true_half_point():
     rate = torch.sigmoid((IMPULSES - 33.0) / 4.0)
     found = half_point(IMPULSES, *envs(rate, 100))
