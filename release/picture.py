@@ -66,7 +66,10 @@ def film(options: Options, stiffness: float) -> list[np.ndarray]:
     args += ["--onset", str(ONSET_S), "--duration", str(LOAD_S), "--episode-seconds", str(ONSET_S + 3.0)]
     times = np.arange(0.0, SECONDS, 1.0 / options.frames_per_second)
     left, top = (SIZE - WIDTH) // 2, round(MARGIN * SIZE)
-    kept = [p[top:-top, left : left + WIDTH] for p in pictures(args, tuple(times), SIZE, SIZE)]
+    shown, fell_s = pictures(args, tuple(times), SIZE, SIZE)
+    if fell_s < SECONDS:
+        raise ValueError(f"the robot fell after {fell_s:.2f} s at {stiffness:g} N/m: nothing to show")
+    kept = [p[top:-top, left : left + WIDTH] for p in shown]
     return [label(p, f"{stiffness:g} N/m", loaded(t, options.force)) for p, t in zip(kept, times, strict=True)]
 
 

@@ -46,7 +46,9 @@ and direction of the push."""
 IMPACT = """The impact is 500 N for 50 ms at the left hand, along x in stance, in a random horizontal direction while
 walking at 0.5 m/s, arms moving; measured for 1 s from its onset. Friction, masses, gains and delay are
 randomised, the torque limits are {robot}'s own. *K 100* is CoTaP at 100 N/m in x and y and 300 N/m in z, k_null 25
-Nm/rad, and alpha 1 unless it is named. The paper measured H1 in Isaac Gym,
+Nm/rad, and alpha 1 unless it is named; where a stiffness stands by itself (*K_ee 300*), it is that of all axes, and
+k_null is that of the training. PD is plain PD with the CoTaP policy, which was trained under CoTaP alone, unless the
+base policy is named; the paper's PD is that of FALCON's policy. The paper measured H1 in Isaac Gym,
 with 4096 envs, and gives neither window nor torque limits: orderings and ratios compare, digits do not."""
 ELSEWHERE = (
     "Its Table I is in [laws](laws/properties.md); `python -m reports.compare_laws` makes its Table VI and Fig. 9."

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from random_policy import save_random_policy
 
 from cotap.agents.checkpoint import sha256
+from cotap.evaluate import pictures
 from reports import reproduce_paper as rp
-from reports.paper import ablation, fidelity, relative, walking, words
+from reports.paper import ablation, fidelity, observation, relative, walking, words
 from reports.paper.arms import COMPLIANT, PD, SOFT, arms, label, mass
 from reports.paper.book import Book
 from reports.paper.tables import IMPACT, ORDERINGS
@@ -30,7 +33,7 @@ def measured(mean: float, half: float = 0.1, **others: float) -> dict[str, Any]:
     def summary(value: float) -> dict[str, Any]:
         return {"mean": value, "std": 1.0, "ci95": [value - half, value + half]}
 
-    measures = {name: summary(mean) for name in (*words.LABELS, "e_upper")}
+    measures = {name: summary(mean) for name in (*words.LABELS, "e_upper", "e_torso_x", "e_torso_y")}
     measures |= {name: summary(value) for name, value in others.items()}
     return {"metrics_without_falls": measures, "settings": {"seed": 0}, "num_falls": 1, "num_envs": 8}
 
@@ -235,6 +238,35 @@ def test_bad_input_is_named_and_nothing_is_written(options, named, tmp_path, mon
     assert stop.value.code == 2
     assert named in capsys.readouterr().err
     assert not (tmp_path / "docs").exists()
+
+
+def test_a_robot_that_fell_is_pictured_as_it_was_before(tmp_path):
+    """It begins anew after its fall; a picture of that would show a robot that stands."""
+    policy = str(save_random_policy(tmp_path / "policy.pt"))
+    args = ["impact", "--num-envs", "1", "--no-randomize", "--checkpoint", policy, "--threads", "1"]
+    _, fell_s = pictures(args, (3.0,), 32, 32)
+    assert 0.1 < fell_s < 3.0
+    (before, late), _ = pictures(args, (fell_s - 0.02, 3.0), 32, 32)
+    (early,), stood = pictures(args, (0.02,), 32, 32)
+    assert stood == math.inf
+    assert np.array_equal(before, late)
+    assert not np.array_equal(early, late)
+
+
+def test_only_what_was_trained_is_spoken_of(book, monkeypatch):
+    there = {"base", "cotap"}
+    monkeypatch.setattr(Book, "has", lambda _, policy: policy in there)
+    monkeypatch.setattr(Book, "checkpoint", lambda *_: {"samples": 15_000_000})
+    monkeypatch.setattr(Book, "run", lambda _, __, policy, *___: measured(1.0) | curve if policy in there else None)
+    curve = {"curve": {"time": []}}
+    monkeypatch.setattr(observation, "plot_curves", lambda *_: None)
+    for part in (ablation.ablation, observation.observation):
+        monkeypatch.setattr(book, "lines", [])
+        part(book)
+        assert not any("Ours, trained so" in line or "the ablation begins" in line for line in book.lines)
+    there |= {"no-ratio"}
+    ablation.ablation(book)
+    assert any("Ours, trained so" in line for line in book.lines)
 
 
 @pytest.mark.slow

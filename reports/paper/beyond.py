@@ -12,8 +12,11 @@ LAWS = {"PD": ["--method", "pd"], "CoTaP, K 300": ["--method", "cotap", "--stiff
 TOUR_ENVS = 512
 """A tour takes twenty times as long as any other test here."""
 SHORT_TOUR = ["--waypoints", "4", "--episode-seconds", "20"]
-ARMS = """Arms move, but where stiffness changes: there they are held. The tour and the peak torque are measured over
-all robots, each until it fell."""
+WHAT = """PD is that of the CoTaP policy. The pushes of the fall curve last {push:g} s, in random horizontal
+directions, arms moving; {level} envs at each of {levels} impulses. The [tour](evaluation.md#cotap-evaluate-tour) moves
+the arms itself, without the policy's own arm actions; its robots are nominal, and its PD has the gains of the tour (kp
+{kp} Nm/rad). Where stiffness changes, arms are held. The tour and the peak torque are measured over all robots, each
+until it fell."""
 CHANGES = {"walking": ["--mode", "walking"], "standing under 15 N": ["--force", "0", "0", "-15"]}
 
 
@@ -22,9 +25,10 @@ def beyond(book: Book) -> None:
     from cotap.evaluation.fall_curve import FallCurve
 
     book.add("", "## Beyond the paper")
-    book.paragraph(ARMS)
+    envs, levels = max(book.envs, FallCurve.levels), FallCurve.levels
+    book.paragraph(WHAT, push=FallCurve.duration, level=envs // levels, levels=levels, kp=tour_gains(book.robot))
     book.table("test", *LAWS)
-    curves = run_all(book, "fall-curve", ["fall-curve"], max(book.envs, FallCurve.levels))
+    curves = run_all(book, "fall-curve", ["fall-curve"], envs)
     show(
         book,
         "impulse at the left hand at which half fall, standing [N s]",
@@ -45,6 +49,15 @@ def beyond(book: Book) -> None:
     if found:
         caption = "Share of envs that fall within 3 s of a push on the left hand, against its impulse."
         plot_fall_curves(book.figure("fall_curve", caption), found)
+
+
+def tour_gains(robot: str) -> str:
+    """Position gains of the arms under PD on the tour [Nm/rad], the least and the largest."""
+    from cotap.evaluation.tour.stance import tour_stance
+    from cotap.robots import ROBOTS
+
+    gains = tour_stance(ROBOTS[robot]()).arm_kp
+    return " to ".join(dict.fromkeys(f"{bound:.0f}" for bound in (float(gains.min()), float(gains.max()))))
 
 
 def run_all(book: Book, name: str, arguments: list[str], envs: int) -> dict[str, Any]:

@@ -39,7 +39,10 @@ def draw_pictures(book: Book, name: str, caption: str, shots: Iterable[Shot]) ->
 
     images = []
     for label, args, times in shots:
-        images += [(f"{label} {t:g} s".strip(), image) for t, image in zip(times, pictures(args, times), strict=True)]
+        shown, fell_s = pictures(args, times)
+        for time, image in zip(times, shown, strict=True):
+            when = f"{time:g} s" if time < fell_s else f"fell after {fell_s:.2f} s"
+            images.append((f"{label} {when}".strip(), image))
     figure, axes = _axes(len(images), (2.6 * len(images), 2.9))
     for axis, (label, image) in zip(axes, images, strict=True):
         axis.imshow(image)

@@ -44,8 +44,7 @@ COMPARED = """By the 95 % intervals of the differences, env by env, from PD with
 Where the answer is no, the measures that are not named are better."""
 
 LIMITS = """Under the robot's own torque limits, an arm joint is at its limit for {own} of the time at K 100, here for
-{free}. A hand whose arm has reached its limits goes as far at any stiffness; what is left of the order by stiffness
-shows here."""
+{free}. e_ee: K 500 < K 100: with the limits {with_limits}; without them {without_limits}."""
 
 BY_MASS = """The push of {impulse:g} N s is the paper's, made smaller by the ratio of the robot's mass to H1's."""
 
@@ -178,6 +177,8 @@ def without_limits(book: Book) -> None:
         LIMITS,
         own=of(book, key("stance", "K 100"), "share_at_limit", 2),
         free=of(book, key("stance", "K 100", "x10"), "share_at_limit", 2),
+        with_limits=verdict(book, key("stance", "K 500"), key("stance", "K 100"), "e_ee"),
+        without_limits=verdict(book, key("stance", "K 500", "x10"), key("stance", "K 100", "x10"), "e_ee"),
     )
 
 

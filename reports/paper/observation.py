@@ -45,11 +45,17 @@ def observation(book: Book) -> None:
         book.row(name, samples(book, policy), *errors, fallen(result), last=paper)
         for axis in "xy":
             curves[f"{name}, {axis}"] = (result["curve"]["time"], result["curve"].get(f"velocity_error_{axis}_abs", []))
+    if book.has("torque-critic"):
+        compare(book)
+    if curves:
+        path = book.figure("torque_observation", "Absolute velocity error, mean over envs that stood.")
+        plot_curves(path, curves, "time since 1 s after the start [s]", "absolute velocity error [m/s]")
+
+
+def compare(book: Book) -> None:
+    """The ablation against the policy that sees the torque."""
     rows = (f"observation-{twin(book)}", "observation-torque-critic")
     values = {"change": "e_torso", "x": "e_torso_x", "y": "e_torso_y"}
     changes = {key: change(book, *rows, value) for key, value in values.items()}
     book.paragraph(WHY, paper=the_paper(book), twin=twin(book), **changes)
     book.paragraph("That the error is larger without the torque: {found}.", found=verdict(book, *rows, "e_torso"))
-    if curves:
-        path = book.figure("torque_observation", "Absolute velocity error, mean over envs that stood.")
-        plot_curves(path, curves, "time since 1 s after the start [s]", "absolute velocity error [m/s]")

@@ -16,8 +16,7 @@ ROWS = (
 )
 """Title, measure, digits, and what the paper shows."""
 WHY = """{paper} has a left elbow that makes much less torque than the right one. Ours makes {ratio} of it; statics
-asks for {static}. At 0.25 Hz an arm is at rest at every moment, and gravity less J^T F holds it, whatever its
-stiffness. Much less torque needs another pose or another load."""
+asks for {static}, gravity less J^T F in the poses that were measured, which does not depend on stiffness."""
 
 
 def periodic(book: Book) -> None:

@@ -26,7 +26,7 @@ ORDERINGS = (
 )  # fmt: skip
 """What Table III shows in both modes: a measure, arms under which it is smaller, arms under which it is larger."""
 LOAD = {"K_z 100": "about 0.12 m", "K_z 500": "about 0.05 m", "PD": "about -0.03 m (reversed)", "alpha 0.5": "damped"}
-"""Fig. 3: hand error in z under -50 N."""
+"""Fig. 4: hand error in z under -50 N."""
 ABLATION = {"no training": (0.950, 0.252), "without the ratio": (1.008, 0.517), "CoTaP": (0.861, 0.107)}
 """Table IV: e_torso [m/s], e_upper [rad]."""
 STATIC = {

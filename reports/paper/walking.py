@@ -11,7 +11,7 @@ SETTINGS = ((300, 0.0), *((stiffness, alpha) for stiffness in (100, 300, 500, 80
 """Stiffness of the hand [N/m] and alpha."""
 ENVS = 1024
 MEASURES = {
-    "e_lin_gait": "velocity error [m/s]",
+    "e_lin_gait": "velocity error, averaged over a stride [m/s]",
     "e_yaw": "yaw-rate error [rad/s]",
     "e_yaw_gait": "the same, averaged over a stride [rad/s]",
     "e_height": "height error [m]",

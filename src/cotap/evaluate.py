@@ -7,6 +7,7 @@ import cotap.uncompiled  # noqa: F401 - before what would load the compiler
 # isort: split
 
 import inspect
+import math
 import sys
 import time
 from dataclasses import dataclass
@@ -239,8 +240,11 @@ def recording(options: RecordingOptions) -> dict[str, Any]:
     return result
 
 
-def pictures(args: list[str], times: tuple[float, ...], width: int = 480, height: int = 480) -> list[np.ndarray]:
-    """Pictures (height, width, 3) of the first env of a protocol that can be filmed, at these times [s].
+def pictures(
+    args: list[str], times: tuple[float, ...], width: int = 480, height: int = 480
+) -> tuple[list[np.ndarray], float]:
+    """Pictures (height, width, 3) of the first env of a protocol that can be filmed, at these times [s], and when it
+    fell [s], infinite if it did not. A robot that has fallen begins anew, so that it is shown as it was just before.
 
     Args:
         args: As for `evaluate`.
@@ -257,9 +261,11 @@ def pictures(args: list[str], times: tuple[float, ...], width: int = 480, height
     if not isinstance(options.protocol, RolloutProtocol):
         raise ValueError(f"{args[0]} cannot be filmed")
     env, policy, _ = prepare(options)
-    film = options.protocol.record(env, policy, max(times)).film
-    rows = [min(max(round(time / env.dt) - 1, 0), len(film) - 1) for time in times]
-    return list(film_frames(env, film[rows], width, height))
+    trajectory = options.protocol.record(env, policy, max(times))
+    film, fell = trajectory.film, trajectory.fell[:, 0].nonzero().flatten().tolist()
+    last = fell[0] - 1 if fell else len(film) - 1
+    rows = [max(min(round(time / env.dt) - 1, last), 0) for time in times]
+    return list(film_frames(env, film[rows], width, height)), env.dt * (fell[0] + 1) if fell else math.inf
 
 
 def _report(table: str, result: dict[str, Any], path: str) -> None:
