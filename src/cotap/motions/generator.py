@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from cotap.checks import require_range
+from cotap.motions.clearance import clear_range
 from cotap.persistence import Stateful, uniform
 from cotap.robots import RobotSpec
 
@@ -37,7 +38,8 @@ class MotionConfig:
     limit_margin_rad: float = 0.1
     """Distance kept from joint limits [rad]."""
     range_rad: float = 1.2
-    """Largest distance of random poses from the default pose, per joint [rad]."""
+    """Largest distance of random poses from the default pose, per joint [rad]; less where the arm would meet the body
+    before."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
@@ -64,7 +66,8 @@ class ArmReference:
 class MotionGenerator(Stateful):
     """Plays segments, each a minimum-jerk move plus an enveloped oscillation, that join with zero velocity.
 
-    Every segment obeys the joints' position limits (less a margin) and a share of their velocity limits.
+    Every segment obeys the joints' position limits (less a margin) and a share of their velocity limits, and keeps each
+    joint from where it alone would bring the arm to the body.
     """
 
     STATE = ("_start", "_goal", "_amplitude", "_cycles", "_out_and_back", "_duration_s", "_time_s")
@@ -76,8 +79,9 @@ class MotionGenerator(Stateful):
         default = torch.tensor([j.default_rad for j in joints])
         low, high = torch.tensor([j.range_rad for j in joints]).unbind(1)
         self.default = default
-        self._low = torch.maximum(low + cfg.limit_margin_rad, default - cfg.range_rad)
-        self._high = torch.minimum(high - cfg.limit_margin_rad, default + cfg.range_rad)
+        low = torch.maximum(low + cfg.limit_margin_rad, default - cfg.range_rad)
+        high = torch.minimum(high - cfg.limit_margin_rad, default + cfg.range_rad)
+        self._low, self._high = clear_range(spec, low, high)
         limit = torch.tensor([j.velocity_limit_rad_s for j in joints])
         self._speed = (cfg.velocity_share * limit).clamp_max(cfg.largest_speed)
         self._joints_per_arm = len(spec.arms[0].joints)

@@ -1,0 +1,76 @@
+"""Bounds of arm joints against MuJoCo's own contacts after mj_forward."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from cotap.motions.clearance import STEP_RAD, clear_range
+from cotap.motions.generator import MotionConfig, MotionGenerator
+from cotap.robots import ROBOTS
+from cotap.robots.mjcf import build_model
+
+
+def overlap(model: mujoco.MjModel, names: list[str], pose: np.ndarray, spec) -> float:
+    """How deep shapes overlap [m] with the named joints at `pose` and all others in the default pose."""
+    data = mujoco.MjData(model)
+    for joint in spec.joints:
+        data.joint(joint.name).qpos = joint.default_rad
+    for name, angle in zip(names, pose, strict=True):
+        data.joint(name).qpos = angle
+    mujoco.mj_forward(model, data)
+    return max((-contact.dist for contact in data.contact), default=0.0)
+
+
+@pytest.fixture
+def model(any_spec) -> mujoco.MjModel:
+    return build_model(any_spec, "full", fixed_base=True)
+
+
+def wide(spec) -> tuple[torch.Tensor, torch.Tensor]:
+    """All of the joints' ranges (U,)."""
+    low, high = torch.tensor([spec.joints[i].range_rad for i in spec.indices(spec.upper_joints)]).unbind(1)
+    return low, high
+
+
+def test_a_bound_that_came_in_is_where_the_arm_meets_the_body(any_spec, model):
+    before, met = wide(any_spec), overlap(model, [], np.zeros(0), any_spec) + 0.002
+    for side, after, sign in zip(before, clear_range(any_spec, *before), (-1.0, 1.0), strict=True):
+        assert (sign * (side - after) >= 0.0).all()
+        for name, old, new in zip(any_spec.upper_joints, side.tolist(), after.tolist(), strict=True):
+            assert overlap(model, [name], np.array([new]), any_spec) <= met
+            if abs(old - new) > STEP_RAD:
+                assert overlap(model, [name], np.array([new + sign * 1.01 * STEP_RAD]), any_spec) > met
+
+
+def test_few_random_poses_of_arms_are_inside_the_body(any_spec, model):
+    """Of G1's 71 % were, with the joints' own limits."""
+    motion = MotionGenerator(MotionConfig(), any_spec, 400, 0.02)
+    rng = torch.Generator().manual_seed(0)
+    motion.reset(torch.ones(400, dtype=torch.bool), rng)
+    met = overlap(model, [], np.zeros(0), any_spec) + 0.002
+    inside = [
+        overlap(model, list(any_spec.upper_joints), pose, any_spec) > met
+        for _ in range(5)
+        for pose in (motion._draw(torch.ones(400, dtype=torch.bool), rng), motion._goal)[1].numpy()
+    ]
+    assert np.mean(inside) < 0.12
+
+
+def test_left_and_right_have_mirrored_bounds():
+    for spec in (make() for make in ROBOTS.values()):
+        low, high = clear_range(spec, *wide(spec))
+        of = dict(zip(spec.upper_joints, zip(low.tolist(), high.tolist(), strict=True), strict=True))
+        for name, bounds in of.items():
+            joint = spec.joints[spec.indices([name])[0]]
+            mirrored = sorted(joint.mirror_sign * bound for bound in of[joint.mirror_name])
+            assert bounds == pytest.approx(mirrored, abs=STEP_RAD / 2)
+
+
+def test_no_bound_moves_where_shapes_meet_in_the_default_pose_only(any_spec):
+    """What touches already cannot be kept apart: bounds that are the default pose itself stay."""
+    default = torch.tensor([any_spec.joints[i].default_rad for i in any_spec.indices(any_spec.upper_joints)])
+    for side in clear_range(any_spec, default, default):
+        torch.testing.assert_close(side, default)
