@@ -215,7 +215,7 @@ class Film:
         require_range("force", self.force, 5.0, 300.0)
         require_output("--output", self.output, (".webp", ".gif"))
         require_output("--picture", self.picture, (".png",))
-        from cotap.evaluation.policy import default_checkpoint
+        from cotap.evaluation.policy import shipped_checkpoint
         from cotap.play import ROBOTS
         from cotap.play.app import App
         from cotap.play.scene import Scene
@@ -225,7 +225,7 @@ class Film:
         port = free_port()
         server = open_server("127.0.0.1", port)
         with tempfile.TemporaryDirectory() as folder:
-            policy = default_checkpoint()
+            policy = shipped_checkpoint("h1-cotap")
             session = Session({policy.stem: policy}, self.seed)
             app = App(server, Scene(server, session.env.spec, len(ROBOTS)), session, Path(folder))
             server.initial_camera.position, server.initial_camera.look_at = (2.1, 1.4, 1.4), (0.0, 0.1, 0.85)

@@ -24,11 +24,11 @@ def main(argv: list[str] | None = None) -> int:
     """Distil for a few iterations from the shipped base, then evaluate the shipped policy. Exit status."""
     argparse.ArgumentParser(description=__doc__).parse_args(argv)
     from cotap.evaluate import main as evaluate
-    from cotap.evaluation.policy import default_checkpoint, shipped_checkpoint
+    from cotap.evaluation.policy import shipped_checkpoint
     from cotap.train import main as train
 
     try:
-        base, policy = shipped_checkpoint("h1-base"), default_checkpoint()
+        base, policy = shipped_checkpoint("h1-base"), shipped_checkpoint("h1-cotap")
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

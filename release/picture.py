@@ -32,7 +32,7 @@ class Options:
     """Down on the left hand [N]."""
     stiffness: tuple[float, float] = (200.0, 800.0)
     """Of the hands, left and right picture [N/m]."""
-    checkpoint: str = "h1-base"
+    checkpoint: str = "h1-cotap"
     """Path of a checkpoint, or the name of one that is shipped."""
     frames_per_second: int = 15
     """Of the film."""

@@ -67,9 +67,8 @@ class Options(Generic[P]):
 
     protocol: tyro.conf.OmitArgPrefixes[P]
     laws: tyro.conf.OmitArgPrefixes[LawOptions]
-    checkpoint: str = ""
-    """Policy to evaluate: a file, or a shipped policy's name. By default h1-base for velocity-tracking; for all others
-    h1-cotap, or h1-base as long as h1-cotap does not ship."""
+    checkpoint: str = "h1-cotap"
+    """Policy to evaluate: a file, or a shipped policy's name."""
     backend: str = "auto"
     """What simulates: mujoco, mjbatch (both on the CPU), warp (a GPU) or auto. auto takes warp if there is a GPU and
     the extra `warp` is installed, else mjbatch if that is installed, else mujoco. Results are reproducible on one
@@ -147,7 +146,7 @@ def prepare(options: Options[Protocol]) -> tuple[HumanoidEnv, Policy, str]:
 
     from cotap.agents.checkpoint import sha256
     from cotap.envs import HumanoidEnv
-    from cotap.evaluation.policy import load_policy, require_acting
+    from cotap.evaluation.policy import find_checkpoint, load_policy, require_acting
     from cotap.sim import resolve_backend
 
     protocol = options.protocol
@@ -157,7 +156,7 @@ def prepare(options: Options[Protocol]) -> tuple[HumanoidEnv, Policy, str]:
     require_outputs(options.json, options.plot, options.video)
     if options.threads:
         torch.set_num_threads(options.threads)
-    path = _checkpoint(options)
+    path = find_checkpoint(options.checkpoint)
     policy = load_policy(path)
     torch.manual_seed(protocol.seed)
     cfg = policy.env_config
@@ -214,8 +213,9 @@ def _measured(options: Options[Protocol], env: HumanoidEnv, policy: Policy) -> d
     """What the protocol finds, in the engine that it names if it names one."""
     if isinstance(options.protocol, Tour) and options.protocol.engine != "mujoco":
         from cotap.deployment.tour import evaluate_in_engine
+        from cotap.evaluation.policy import find_checkpoint
 
-        return evaluate_in_engine(options.protocol, _checkpoint(options), env.cfg)
+        return evaluate_in_engine(options.protocol, find_checkpoint(options.checkpoint), env.cfg)
     return options.protocol.evaluate(env, policy)
 
 
@@ -274,15 +274,6 @@ def _report(table: str, result: dict[str, Any], path: str) -> None:
     print(table)
     if path:
         write_json(Path(path), result)
-
-
-def _checkpoint(options: Options[Protocol]) -> Path:
-    """The file that the options mean."""
-    from cotap.evaluation.policy import default_checkpoint, find_checkpoint, shipped_checkpoint
-
-    if options.checkpoint:
-        return find_checkpoint(options.checkpoint)
-    return shipped_checkpoint() if isinstance(options.protocol, VelocityTracking) else default_checkpoint()
 
 
 def _method(env: HumanoidEnv) -> str:

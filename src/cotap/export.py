@@ -19,9 +19,8 @@ class ExportOptions:
 
     output: str
     """File to write (.onnx)."""
-    checkpoint: str = ""
-    """Policy to export: a file, or a shipped policy's name. By default h1-cotap, or h1-base as long as h1-cotap does
-    not ship."""
+    checkpoint: str = "h1-cotap"
+    """Policy to export: a file, or a shipped policy's name."""
     checks: int = 1000
     """Observations on which to compare file and torch. The file is kept only if they agree."""
     seed: int = 0
@@ -34,7 +33,7 @@ def main(argv: list[str] | None = None) -> int:
     options = tyro.cli(ExportOptions, args=argv, prog="cotap export")
     try:
         from cotap.deployment.graph import export_policy
-        from cotap.evaluation.policy import default_checkpoint, find_checkpoint
+        from cotap.evaluation.policy import find_checkpoint
 
         require_range("checks", require_positive_int("checks", options.checks), 1, 1_000_000)
         require_seed("seed", options.seed)
@@ -42,8 +41,7 @@ def main(argv: list[str] | None = None) -> int:
         if output.suffix != ".onnx":
             raise ValueError(f"--output must end in .onnx, got {options.output!r}")
         require_output("--output", options.output)
-        checkpoint = find_checkpoint(options.checkpoint) if options.checkpoint else default_checkpoint()
-        summary, worst = export_policy(checkpoint, output, options.checks, options.seed)
+        summary, worst = export_policy(find_checkpoint(options.checkpoint), output, options.checks, options.seed)
     except (ValueError, OSError, ModuleNotFoundError) as error:
         print(f"error: {shortened(str(error))}", file=sys.stderr)
         return 2

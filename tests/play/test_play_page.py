@@ -48,7 +48,7 @@ def test_processor_time_of_no_process_is_no_number():
 def test_a_small_film(tmp_path, capsys, checkpoint, monkeypatch):
     from PIL import Image
 
-    monkeypatch.setattr("cotap.evaluation.policy.default_checkpoint", lambda: checkpoint)
+    monkeypatch.setattr("cotap.evaluation.policy.shipped_checkpoint", lambda _: checkpoint)
     film, still = tmp_path / "play.webp", tmp_path / "play.png"
     arguments = ["film", "--output", str(film), "--picture", str(still), "--scale", "0.2", "--fps", "2"]
     assert play_page.main(arguments) == 0

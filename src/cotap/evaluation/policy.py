@@ -52,11 +52,6 @@ def find_checkpoint(given: str) -> Path:
     return shipped_checkpoint(given) if given in CHECKPOINTS else Path(given)
 
 
-def default_checkpoint() -> Path:
-    """What compliance is evaluated with: the distilled policy if it is shipped, else the base."""
-    return shipped_checkpoint("h1-cotap" if "h1-cotap" in shipped_names() else "h1-base")
-
-
 @dataclass(frozen=True)
 class Policy:
     """A trained policy, in float32, with what it was trained for."""
