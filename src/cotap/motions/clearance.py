@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+# MuJoCo's extension module has no type stubs.
+# pyright: reportAttributeAccessIssue=false
 import math
 
 import mujoco
