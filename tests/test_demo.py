@@ -13,15 +13,16 @@ from examples import demo
 
 @pytest.fixture
 def shipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Only the base is shipped; nothing reads it."""
-    (tmp_path / "h1-base.pt").touch()
+    """Policies of H1 are shipped; nothing reads them."""
+    for name in ("h1-base", "h1-cotap"):
+        (tmp_path / f"{name}.pt").touch()
     monkeypatch.setattr("cotap.evaluation.policy.checkpoint_path", lambda name: tmp_path / f"{name}.pt")
 
 
 @pytest.mark.usefixtures("in_tmp_path", "shipped")
 def test_it_ends_with_the_command_that_the_readme_has_for_the_page(monkeypatch, capsys):
     def evaluate(arguments):
-        assert Path(arguments[arguments.index("--checkpoint") + 1]).name == "h1-base.pt"
+        assert Path(arguments[arguments.index("--checkpoint") + 1]).name == "h1-cotap.pt"
         parse(arguments)
         if "--json" in arguments:
             value = {"mean": 0.5, "ci95": [0.4, 0.6]}
