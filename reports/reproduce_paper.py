@@ -38,8 +38,8 @@ PARTS: dict[str, Callable[[Book], None]] = {
     "pictures": pictures,
 }
 HEAD = """Written by `{command}`: do not edit. {envs} envs a row unless said otherwise. Means are over the envs that
-stood unless said otherwise, with bootstrap 95 % intervals; shares of falls are over all envs, from the start to the end
-of the episode, with Wilson's. Arms that move play clips half of the time and generated motion otherwise. One
+stood unless said otherwise, with bootstrap 95 % intervals in brackets; shares of falls are over all envs, from the
+start to the end of the episode, with Wilson's. Arms that move play clips half of the time and generated motion otherwise. One
 training stands behind each policy unless said otherwise: intervals are over envs, not over trainings. A difference
 between two rows is taken env by env, over those that stood in both; both begin with the same friction, masses, motion
 and direction of the push."""

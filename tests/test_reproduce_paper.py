@@ -62,17 +62,17 @@ def test_better_than_pd_is_better_in_all_three(book):
 
 def test_differences_are_those_of_the_rows(book):
     book.results |= {"a": measured(1.0), "b": measured(3.0)}
-    assert words.change(book, "b", "a", "e_torso") == "-2.000 (-2.141 to -1.859)"  # 0.1 x sqrt(2) to either side
+    assert words.change(book, "b", "a", "e_torso") == "-2.000 [-2.141,-1.859]"  # 0.1 x sqrt(2) to either side
     assert book.differences["e_torso: a - b"]["difference"] == -2.0
 
 
 def test_numbers_are_shown_with_interval_or_reason():
-    assert words.number({"mean": 0.12345, "ci95": [0.1, 0.2]}) == "0.123 (0.100 to 0.200)"
+    assert words.number({"mean": 0.12345, "ci95": [0.1, 0.2]}) == "0.123 [0.100,0.200]"
     assert words.number({"mean": None, "ci95": None, "reason": "no env stood"}) == "(no env stood)"
     assert words.number({"mean": 31.0, "ci95": None, "reason": "wide"}, 0) == "31 (wide)"
     assert words.number(None) == "(not measured)"
-    assert words.hundredfold({"mean": 0.5, "ci95": [0.25, 0.75]}) == "50.0 (25.0 to 75.0)"
-    assert words.fallen({"num_falls": 1, "num_envs": 8}) == "12.5 (2.2 to 47.1)"
+    assert words.hundredfold({"mean": 0.5, "ci95": [0.25, 0.75]}) == "50.0 [25.0,75.0]"
+    assert words.fallen({"num_falls": 1, "num_envs": 8}) == "12.5 [2.2,47.1]"
 
 
 @pytest.mark.parametrize("robot", ["h1", "g1"])
@@ -133,10 +133,10 @@ def test_an_ablation_outside_the_trainings_is_marked(book, monkeypatch):
     monkeypatch.setattr(Book, "run", lambda _, __, policy, *___: run.get(policy))
     ablation.ablation(book)
     rows = {line.split(" | ")[0][2:]: line.split(" | ")[1:4] for line in book.lines if line.startswith("| ")}
-    assert rows["without the ratio"] == ["15.0", "**8.000 (7.900 to 8.100)**", "2.000 (1.900 to 2.100)"]
-    assert rows["goals observed"][1] == "4.000 (3.900 to 4.100)"
+    assert rows["without the ratio"] == ["15.0", "**8.000 [7.900,8.100]**", "2.000 [1.900,2.100]"]
+    assert rows["goals observed"][1] == "4.000 [3.900,4.100]"
     assert rows["CoTaP, three seeds"][1] == "2.000 (range 1.000 to 3.000; interval -2.968 to 6.968)"
-    assert rows["CoTaP"][1] == "9.000 (8.900 to 9.100)"  # another training, not marked
+    assert rows["CoTaP"][1] == "9.000 [8.900,9.100]"  # another training, not marked
     del values["seed-1"]
     book.lines.clear()
     ablation.ablation(book)
@@ -164,7 +164,7 @@ def test_the_relative_change_has_a_bootstrap_interval():
 def test_an_error_without_bound_is_the_largest():
     rows = [{"axis": "x", "error": -0.3, "ci95": [-0.4, -0.2], "n": 4}, {"axis": "x", "error": 0.1, "n": 4},
             {"axis": "y", "error": None, "n": 4}, {"axis": "z", "error": None, "n": 0}]  # fmt: skip
-    assert [fidelity.worst(rows, axis) for axis in "xyz"] == ["-30% (-40% to -20%)", "no bound", "(not measured)"]
+    assert [fidelity.worst(rows, axis) for axis in "xyz"] == ["-30% [-40%,-20%]", "no bound", "(not measured)"]
     assert fidelity.single_hands({"50": 0.021, "95": None}) == "2.1%, no bound"
 
 
@@ -279,7 +279,7 @@ def test_a_part_end_to_end(robot, parts, tmp_path, monkeypatch):
     assert rp.main([*options, "--only", *parts]) == 0
     page = (tmp_path / "runs/paper-quick" / ("results.md" if robot == "h1" else "results_g1.md")).read_text()
     assert "| K_z 500 |" in page
-    assert "100.0 (67.6 to 100.0)" in page  # all fell
+    assert "100.0 [67.6,100.0]" in page  # all fell
     assert (tmp_path / f"runs/paper-quick/results/{robot}/constant_load.png").stat().st_size > 5000
     kept = json.loads((tmp_path / f"runs/paper-quick/results/{robot}/results.json").read_text())
     assert kept["rows"]["load-PD"]["num_envs"] == 8

@@ -64,7 +64,7 @@ def worst(rows: list[dict[str, Any]], axis: str) -> str:
     if None in [r["error"] for r in measured]:
         return "no bound"
     largest = max(measured, key=lambda r: abs(r["error"]))
-    return f"{largest['error']:+.0%} ({largest['ci95'][0]:+.0%} to {largest['ci95'][1]:+.0%})"
+    return f"{largest['error']:+.0%} [{largest['ci95'][0]:+.0%},{largest['ci95'][1]:+.0%}]"
 
 
 def single_hands(quantiles: dict[str, float | None] | None) -> str:

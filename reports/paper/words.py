@@ -30,7 +30,7 @@ def number(m: dict[str, Any] | None, digits: int = 3) -> str:
     if m["ci95"] is None:
         return f"{m['mean']:.{digits}f} ({m['reason']})"
     low, high = m["ci95"]
-    return f"{m['mean']:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
+    return f"{m['mean']:.{digits}f} [{low:.{digits}f},{high:.{digits}f}]"
 
 
 def hundredfold(m: dict[str, Any] | None, digits: int = 1) -> str:
@@ -91,7 +91,7 @@ def change(book: Book, first: str, second: str, measure: str, digits: int = 3) -
     d = compared(book, first, second, measure)
     if d["difference"] is None:
         return f"({d['reason']})"
-    return f"{d['difference']:+.{digits}f} ({d['ci95'][0]:+.{digits}f} to {d['ci95'][1]:+.{digits}f})"
+    return f"{d['difference']:+.{digits}f} [{d['ci95'][0]:+.{digits}f},{d['ci95'][1]:+.{digits}f}]"
 
 
 def verdict(book: Book, smaller: str, larger: str, measure: str, digits: int = 3) -> str:
