@@ -43,9 +43,9 @@ def test_the_page_compares_every_mode(tmp_path):
     out = tmp_path / "docs.md"
     assert redundancy.main(["--h1", h1, "--g1", g1, "--output", str(out)]) == 0
     page = out.read_text()
-    assert "| e_torso | K 100 | -10.0 (-11.0 to -9.0) | -20.0 (-21.0 to -19.0) | more |" in page
+    assert "| e_torso | K 100 | -10.0 [-11.0,-9.0] | -20.0 [-21.0,-19.0] | more |" in page
     assert "**Of 75 comparisons 75 say more, 0 less, and 0 cannot be distinguished; 25 were not measured.**" in page
-    assert "| e_torso | K 100 | -10.0 (-11.0 to -9.0) | (not measured) | not measured |" in page.split("## Walking")[2]
+    assert "| e_torso | K 100 | -10.0 [-11.0,-9.0] | (not measured) | not measured |" in page.split("## Walking")[2]
 
 
 @pytest.mark.parametrize(
