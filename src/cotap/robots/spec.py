@@ -132,6 +132,11 @@ class RobotSpec:
         return tuple(n for n in self.joint_names if n not in self.upper_joints)
 
     @cached_property
+    def waist_joints(self) -> tuple[str, ...]:
+        """Joints between the base and the torso, from the base up."""
+        return tuple(body.joint for body in self.chain(self.torso_body, self.base_body) if body.joint is not None)
+
+    @cached_property
     def mass_kg(self) -> float:
         """Of all bodies."""
         return sum(b.mass_kg for b in self.bodies)
