@@ -8,16 +8,18 @@ from cotap.robots.from_facts import Gains, robot_from_facts, shipped_facts
 from cotap.robots.shapes import COLORS, capsule
 from cotap.robots.spec import ArmSpec, FootSpec, GeomSpec, RobotSpec
 
-# Legs: Unitree's of unitree_rl_gym. Waist: FALCON's, where the lower agent moves it too. Arms: Unitree's of the
-# examples of unitree_sdk2, halved at the wrists, which hold 5 Nm. The default pose of the legs has the centre of mass
-# over the middle of the soles.
+# Legs: mjlab's, which damp what is left of white noise in the actions: with Unitree's (100 Nm/rad and 2 Nms/rad at the
+# hips) it turns a standing G1's torso twice as fast. Waist: FALCON's stiffness, with three times its damping, for the
+# same reason. Arms: Unitree's of the examples of unitree_sdk2, halved at the wrists, which hold 5 Nm. The default pose
+# of the legs has the centre of mass over the middle of the soles.
 _GAINS = {
-    "hip": Gains(100.0, 2.0),
-    "hip_pitch": Gains(100.0, 2.0, -0.13),
-    "knee": Gains(150.0, 4.0, 0.3),
-    "ankle": Gains(40.0, 2.0),
-    "ankle_pitch": Gains(40.0, 2.0, -0.17),
-    "waist": Gains(300.0, 5.0),
+    "hip": Gains(40.2, 2.56),
+    "hip_roll": Gains(99.1, 6.31),
+    "hip_pitch": Gains(40.2, 2.56, -0.13),
+    "knee": Gains(99.1, 6.31, 0.3),
+    "ankle": Gains(28.5, 1.81),
+    "ankle_pitch": Gains(28.5, 1.81, -0.17),
+    "waist": Gains(300.0, 15.0),
     "shoulder": Gains(40.0, 1.0),
     "elbow": Gains(40.0, 1.0),
     "wrist": Gains(20.0, 0.5),
