@@ -169,7 +169,7 @@ CASES = [
     ("track_velocity", {"torso_linear_velocity_h": [[0.5, -0.2, 9.0]]}, 1.0),
     ("track_velocity_closely", {"velocity_h": [[0.6, -0.2]]}, math.exp(-0.01 / 0.04)),
     ("track_mean_velocity", {"mean_error": [[0.1, -0.05, 9.0]]}, math.exp(-(0.01 + 0.0025) / 0.015)),
-    ("track_mean_yaw_rate", {"mean_error": [[9.0, 9.0, -0.1]]}, math.exp(-0.01 / 0.02)),
+    ("track_mean_yaw_rate", {"mean_error": [[9.0, 9.0, -0.1]]}, math.exp(-0.01 / 0.05)),
     ("track_yaw_rate", {"yaw_rate": [0.1]}, math.exp(-0.09)),
     ("track_yaw_rate_closely", {"yaw_rate": [0.3]}, math.exp(-0.01 / 0.06)),
     ("track_yaw_rate_closely", {"yaw_rate": [0.5]}, math.exp(-0.01 / 0.06)),

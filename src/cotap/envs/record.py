@@ -16,7 +16,7 @@ from cotap.robots import RobotSpec
 
 
 class Recorder(Stateful):
-    """Makes each step's record, and keeps the velocity errors' running average.
+    """Makes each step's record, and keeps the velocity errors of the last stride.
 
     Args:
         spec: The robot.
@@ -26,7 +26,7 @@ class Recorder(Stateful):
         gait_period_s: Duration of a stride [s].
     """
 
-    STATE = ("mean_error",)
+    STATE = ("_errors",)
 
     def __init__(self, spec: RobotSpec, reader: StateReader, num_envs: int, dt: float, gait_period_s: float) -> None:
         self._scales, self._reader = RobotScales.of(spec), reader
@@ -35,13 +35,17 @@ class Recorder(Stateful):
         self._elbows = [
             [link.name for link in chain].index(arm.elbow_body) for chain, arm in zip(chains, spec.arms, strict=True)
         ]
-        self._share = min(2.0 * dt / gait_period_s, 1.0)
-        self.mean_error = torch.zeros(num_envs, 3)
-        """(N, 3) velocity errors, averaged exponentially over half a stride."""
+        self._errors = torch.zeros(num_envs, max(1, round(gait_period_s / dt)), 3)  # of each step, the newest last
+
+    @property
+    def mean_error(self) -> torch.Tensor:
+        """(N, 3) velocity errors, averaged over the last stride, zero before the episode: what sways or twists with
+        every step cancels out."""
+        return self._errors.mean(1)
 
     def reset(self, mask: torch.Tensor) -> None:
         """Episodes begin in the envs of `mask` (N,)."""
-        self.mean_error = self.mean_error.masked_fill(mask.unsqueeze(1), 0.0)
+        self._errors = self._errors.masked_fill(mask[:, None, None], 0.0)
 
     def record(
         self, s: RobotState, command: Command, reference: ArmReference, action: torch.Tensor,
@@ -79,7 +83,7 @@ class Recorder(Stateful):
         error = torch.cat((s.torso_linear_velocity_h[:, :2] - c.velocity_h, (s.yaw_rate - c.yaw_rate).unsqueeze(1)), 1)
         # An env that has diverged is about to restart; its error must not outlast it.
         error = torch.nan_to_num(error, 0.0, 0.0, 0.0).clamp(-10.0, 10.0)
-        self.mean_error = torch.lerp(self.mean_error, error, self._share)
+        self._errors = torch.cat((self._errors[:, 1:], error.unsqueeze(1)), 1)
         return self.mean_error
 
     def _key_points(self, arms: ChainPose, rates: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

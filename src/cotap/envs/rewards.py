@@ -53,7 +53,7 @@ class StepRecord:
     key_velocities_reference_t: torch.Tensor
     """(N, P, 3) [m/s]."""
     mean_error: torch.Tensor
-    """(N, 3) horizontal velocity [m/s] and yaw rate [rad/s] minus their commands, averaged over about half a stride."""
+    """(N, 3) horizontal velocity [m/s] and yaw rate [rad/s] minus their commands, averaged over the last stride."""
     fell: torch.Tensor
     """(N,) bool: the episode ends in a fall."""
     hand_force_w: torch.Tensor
@@ -172,7 +172,7 @@ class LowerRewards:
 
     @term(3.0)
     def track_mean_velocity(s: StepRecord) -> torch.Tensor:
-        """Velocity averaged over about half a stride: what sways with every step is no reason to walk too slowly."""
+        """Velocity averaged over a stride: what sways with every step is no reason to walk too slowly."""
         return torch.exp(-s.mean_error[:, :2].square().sum(1) / 0.015)
 
     @term(1.0)
@@ -185,10 +185,10 @@ class LowerRewards:
         """Angular velocity about the vertical against its command, narrow kernel."""
         return torch.exp(-(s.command.yaw_rate - s.state.yaw_rate).square() / 0.06)
 
-    @term(1.5)
+    @term(3.0)
     def track_mean_yaw_rate(s: StepRecord) -> torch.Tensor:
-        """Yaw rate averaged over about half a stride."""
-        return torch.exp(-s.mean_error[:, 2].square() / 0.02)
+        """Yaw rate averaged over a stride: a robot that twists with every step is paid for turning all the same."""
+        return torch.exp(-s.mean_error[:, 2].square() / 0.05)
 
     @term(3.0)
     def track_height(s: StepRecord) -> torch.Tensor:
