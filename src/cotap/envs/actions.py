@@ -21,8 +21,7 @@ class ActionConfig:
     before a radian has that share of it."""
     waist_share: float = 1.0
     """Share of that for joints between the base and the torso. They turn the torso itself, whose rates are observed
-    and rewarded: with equal random actions a standing G1's waist turns it at 1.8 rad/s RMS about the vertical, its legs
-    at 1.1 rad/s."""
+    and rewarded: by equal random actions a standing G1's waist turns it faster than its legs do."""
     upper_scale: float = 0.1
     """Radians per unit of upper action."""
     upper_mode: str = "residual"
