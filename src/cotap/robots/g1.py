@@ -8,9 +8,8 @@ from cotap.robots.from_facts import Gains, robot_from_facts, shipped_facts
 from cotap.robots.shapes import COLORS, capsule
 from cotap.robots.spec import ArmSpec, FootSpec, GeomSpec, RobotSpec
 
-# Legs: mjlab's, which damp what is left of white noise in the actions: with Unitree's (100 Nm/rad and 2 Nms/rad at the
-# hips) it turns a standing G1's torso twice as fast. Waist: FALCON's stiffness, with three times its damping, for the
-# same reason. Arms: Unitree's of the examples of unitree_sdk2, halved at the wrists, which hold 5 Nm. The default pose
+# Legs: mjlab's. With those of unitree_rl_gym, equal random actions turn a standing G1's torso twice as fast. Waist:
+# FALCON's stiffness, with three times its damping, for the same reason. Arms: Unitree's of the examples of unitree_sdk2, halved at the wrists, which hold 5 Nm. The default pose
 # of the legs has the centre of mass over the middle of the soles.
 _GAINS = {
     "hip": Gains(40.2, 2.56),
