@@ -9,8 +9,9 @@ from cotap.robots.shapes import COLORS, capsule
 from cotap.robots.spec import ArmSpec, FootSpec, GeomSpec, RobotSpec
 
 # Legs: mjlab's. With those of unitree_rl_gym, equal random actions turn a standing G1's torso twice as fast. Waist:
-# FALCON's stiffness, with three times its damping, for the same reason. Arms: Unitree's of the examples of unitree_sdk2, halved at the wrists, which hold 5 Nm. The default pose
-# of the legs has the centre of mass over the middle of the soles.
+# FALCON's stiffness, with three times its damping, for the same reason. Arms: Unitree's of the examples of
+# unitree_sdk2, halved at the wrists, which hold 5 Nm. The default pose of the legs has the centre of mass over the
+# middle of the soles.
 _GAINS = {
     "hip": Gains(40.2, 2.56),
     "hip_roll": Gains(99.1, 6.31),
