@@ -23,6 +23,8 @@ from cotap.envs.hand_loads import HandLoadConfig
 from cotap.envs.observations import ObservationConfig
 from cotap.envs.pushes import PushConfig
 from cotap.envs.rewards import UpperRewards
+from cotap.motions.generator import MotionConfig
+from cotap.motions.reference import ClipConfig, ReferenceConfig
 
 
 @dataclass
@@ -60,6 +62,10 @@ def default() -> BaseTraining:
     return BaseTraining(
         env=HumanoidEnvConfig(
             num_envs=1024,
+            actions=ActionConfig(waist_share=0.5),
+            motions=ReferenceConfig(
+                clips=ClipConfig(acceleration=40.0, blend_speed=0.12), generator=MotionConfig(largest_speed=4.5)
+            ),
             assist=AssistConfig(enabled=True),
             curriculum=CurriculumConfig(arm_motion_samples=3e6),
             forces=ExternalForceConfig(
@@ -73,14 +79,10 @@ def default() -> BaseTraining:
 
 def quick() -> BaseTraining:
     """Walking in the shortest time: no pushes, no loads; 30 M samples."""
-    return BaseTraining(
-        env=HumanoidEnvConfig(
-            num_envs=1024,
-            assist=AssistConfig(enabled=True),
-            curriculum=CurriculumConfig(arm_motion_samples=3e6),
-        ),
-        runner=RunnerConfig(iterations=1220),
-    )
+    training = default()
+    training.env.forces = ExternalForceConfig()
+    training.runner.iterations = 1220
+    return training
 
 
 def paper() -> BaseTraining:
