@@ -91,14 +91,18 @@ def test_pushes_do_not_grow_while_many_fall(make_env, robot):
 
 
 def test_arms_move_less_while_many_fall():
-    """By 100 of 400 samples a step; between half of the limit and the limit they stay as they are."""
+    """By 100 of 400 samples a step. Disturbances wait until arms move wholly again."""
     curriculum = Curriculum(CurriculumConfig(max_falls_per_s=0.02, arm_motion_samples=400), dt=1.0)
     nobody = torch.zeros(1000, dtype=torch.bool)
-    for falls, after in ((0.03, 0.75), (0.021, 0.5), (0.019, 0.5), (0.011, 0.5), (0.009, 0.75), (0.0, 1.0), (0.0, 1.0)):
+    for falls, after, samples in (
+        (0.0, 1.0, 100), (0.03, 0.75, 100), (0.021, 0.5, 100), (0.019, 0.75, 100), (0.011, 1.0, 100), (0.0, 1.0, 200),
+        (0.021, 0.75, 200),
+    ):  # fmt: skip
         curriculum.falls_per_s = falls / 0.9  # a step without falls takes a tenth away
         curriculum.step(nobody, 100)
         assert curriculum.falls_per_s == pytest.approx(falls)
         assert curriculum.arm_motion == pytest.approx(after)
+        assert curriculum.samples == samples
     for _ in range(9):
         curriculum.step(~nobody, 100)
     assert curriculum.arm_motion == 0.0

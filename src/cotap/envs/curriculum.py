@@ -50,8 +50,8 @@ class CurriculumConfig:
     """What many falls hold back. The assistance fades all the same: robots that keep it lean on it."""
 
     max_falls_per_s: float = 0.02
-    """Falls per second and env above which no disturbance grows and the arms' motion shrinks; it grows below half of
-    that."""
+    """Falls per second and env above which no disturbance grows and the arms' motion shrinks. Below, that grows back
+    first: disturbances wait until it is whole."""
     arm_motion_samples: float = 0.0
     """Samples in which the arms' motion shrinks from whole to none, or grows back; 0 leaves it whole."""
 
@@ -62,8 +62,8 @@ class CurriculumConfig:
 
 
 class Curriculum:
-    """How far disturbances have grown (the samples, but for those that were taken while robots fell too often), and how
-    far arms move."""
+    """How far disturbances have grown (the samples, but for those that were taken while robots fell too often or arms
+    moved less), and how far arms move."""
 
     def __init__(self, cfg: CurriculumConfig, dt: float) -> None:
         self._cfg, self._dt = cfg, dt
@@ -75,13 +75,12 @@ class Curriculum:
     def step(self, fell: torch.Tensor, samples: int) -> None:
         """Count the `samples` of a step in which the envs of `fell` (N,) have fallen."""
         self.falls_per_s += self._share * (float(fell.float().mean()) / self._dt - self.falls_per_s)
-        limit = self._cfg.max_falls_per_s
-        if self.falls_per_s <= limit:
+        many = self.falls_per_s > self._cfg.max_falls_per_s
+        if self.arm_motion == 1.0 and not many:
             self.samples += samples
         if self._cfg.arm_motion_samples > 0.0:
-            direction = -1 if self.falls_per_s > limit else 1 if self.falls_per_s < 0.5 * limit else 0
-            change = direction * samples / self._cfg.arm_motion_samples
-            self.arm_motion = min(1.0, max(0.0, self.arm_motion + change))
+            change = samples / self._cfg.arm_motion_samples
+            self.arm_motion = min(1.0, max(0.0, self.arm_motion + (-change if many else change)))
 
     def state_dict(self) -> dict[str, float]:
         """What goes on from step to step."""
