@@ -224,11 +224,16 @@ def _base_config(checkpoint: str) -> BaseTraining:
     return training
 
 
+_RETIRED_TERM = "track_height_widely"
+"""A reward that H1's shipped base was trained with; `track_height` alone does its work now."""
+
+
 def _config_of(checkpoint: str, kind: type[Any]) -> Any:
     from cotap.agents.checkpoint import MALFORMED, CheckpointError, load_checkpoint
 
     content = load_checkpoint(checkpoint)
     try:
+        content["config"]["training"]["env"]["rewards"]["lower"].pop(_RETIRED_TERM, None)
         return from_plain(kind, content["config"]["training"])
     except MALFORMED as error:
         raise CheckpointError(f"checkpoint {checkpoint!r} has no usable config: {reason_of(error)}") from error

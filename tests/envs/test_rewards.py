@@ -148,7 +148,7 @@ AT_REST = {"velocity_h": [[0.0, 0.0]], "torso_linear_velocity_h": [[0.0, 0.0, 0.
 BEST = {
     "track_velocity": 1.0, "track_velocity_closely": 1.0, "track_mean_velocity": 1.0, "track_mean_yaw_rate": 1.0,
     "track_yaw_rate": 1.0, "track_yaw_rate_closely": 1.0,
-    "track_height": 1.0, "track_height_widely": 1.0, "contact_schedule": 1.0, "alive": 1.0, "track_arms": 1.0,
+    "track_height": 1.0, "contact_schedule": 1.0, "alive": 1.0, "track_arms": 1.0,
     "reference_closeness": 1.0, "track_key_points": 1.0, "track_key_velocities": 1.0, "track_hands_as_facet": 1.0,
 }  # fmt: skip
 ALL_TERMS = sorted({f.name for group in (LowerRewards, UpperRewards) for f in dataclasses.fields(group)})
@@ -173,8 +173,8 @@ CASES = [
     ("track_yaw_rate", {"yaw_rate": [0.1]}, math.exp(-0.09)),
     ("track_yaw_rate_closely", {"yaw_rate": [0.3]}, math.exp(-0.01 / 0.06)),
     ("track_yaw_rate_closely", {"yaw_rate": [0.5]}, math.exp(-0.01 / 0.06)),
-    ("track_height", {"torso_pos_w": [[3.0, -2.0, 0.96]]}, math.exp(-0.0016 / 0.0025)),
-    ("track_height_widely", {"torso_pos_w": [[3.0, -2.0, 0.8]]}, math.exp(-0.04 / 0.04)),
+    ("track_height", {"torso_pos_w": [[3.0, -2.0, 0.96]]}, 1.0 - 0.04 / 0.15),
+    ("track_height", {"torso_pos_w": [[3.0, -2.0, 1.03]]}, 1.0 - 0.03 / 0.15),
     # Standing 0.1 m behind the middle of the feet, heading to (0.05, -0.06) m of it.
     ("capture_point", {**STANDING, "torso_pos_w": [[2.9, -2.0, HEIGHT]]}, math.exp(-(0.05**2 + 0.06**2) / 0.01)),
     ("capture_point", {**STANDING, "heading_w": matrix_about_z(math.pi / 2)}, math.exp(-(0.06**2 + 0.15**2) / 0.01)),
