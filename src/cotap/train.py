@@ -81,7 +81,7 @@ class DistillOptions:
     shipped base policy."""
     recipe: str = "default"
     """default, quick, paper, facet, modulated, no-ratio, torque-critic or goals. default: 80 to 1200 N/m. quick: a
-    short default. paper: 150 to 450 N/m. facet: arms under FACET, with its tracking reward. modulated: the policy sets
+    short default. paper: 150 to 450 N/m. facet: arms under PD, FACET's tracking reward. modulated: the policy sets
     alpha and stiffness. The others are ablations. Where networks see or do something else than the base's, those are
     refitted."""
     command: tyro.conf.Suppress[str] = ""
