@@ -13,7 +13,7 @@ TOUR_ENVS = 512
 """A tour takes twenty times as long as any other test here."""
 SHORT_TOUR = ["--waypoints", "4", "--episode-seconds", "20"]
 WHAT = """PD is that of the CoTaP policy. The pushes of the fall curve last {push:g} s, in random horizontal
-directions, arms moving; {level} envs at each of {levels} impulses. The [tour](evaluation.md#the-punch-tour) moves
+directions, arms moving; {level} envs at each of {levels} impulses. The [tour](tour.md) moves
 the arms itself, without the policy's own arm actions; its robots are nominal, and its PD has the gains of the tour (kp
 {kp} Nm/rad). Where stiffness changes, arms are held. The tour and the peak torque are measured over all robots, each
 until it fell."""

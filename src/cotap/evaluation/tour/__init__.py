@@ -1,1 +1,1 @@
-"""The punch tour: 90 s of walking to waypoints while arms wander and punches land (docs/evaluation.md)."""
+"""The punch tour: 90 s of walking to waypoints while arms wander and punches land (docs/tour.md)."""
