@@ -60,6 +60,18 @@ def test_virtual_mass_is_a_damped_oscillator(ratio, mass):
         assert np.abs(error / (force / stiffness).numpy()).max() < 1e-3
 
 
+def test_a_light_hand_in_honey_creeps_to_where_a_force_holds_it():
+    """At the ends of what is allowed: `exp(-5 s * w / (2 ratio))` of the way is left, as inertia is none to speak
+    of."""
+    model, home, force = VirtualMass(0.01, 100.0), torch.zeros(1), torch.tensor([10.0])
+    x, v = home, torch.zeros(1)
+    for _ in range(250):
+        x, v = model(x, v, home, home, torch.tensor([2000.0]), force, DT)
+    left = np.exp(-5.0 * np.sqrt(2000.0 / 0.01) / 200.0)
+    assert float(x) == pytest.approx(10.0 / 2000.0 * (1.0 - left), rel=1e-3)
+    assert float(v) == pytest.approx(10.0 / 2000.0 * left * np.sqrt(2000.0 / 0.01) / 200.0, rel=0.02, abs=1e-9)
+
+
 def test_a_virtual_mass_is_of_one_kilogram_and_critically_damped_by_default():
     x, _ = VirtualMass()(*torch.zeros(4, 1), torch.tensor([400.0]), torch.tensor([20.0]), 0.05)
     assert float(x) == pytest.approx(float(step_response(0.05, 1.0, 400.0, 1.0, 20.0)), rel=1e-5)

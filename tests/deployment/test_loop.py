@@ -6,7 +6,9 @@ import dataclasses
 import itertools
 import json
 import math
+import os
 import re
+import tty
 
 import numpy as np
 import onnx
@@ -14,6 +16,7 @@ import pytest
 import torch
 
 from cotap.deploy import main as deploy
+from cotap.deployment import keyboard
 from cotap.deployment.controller import Controller, Readings, law_config, measured, robot_of
 from cotap.deployment.engines import EngineConfig, make_engine
 from cotap.deployment.joint_law import JointLaw, damped_law, pd_law
@@ -416,6 +419,17 @@ def test_bad_scenarios_are_named(text, message, policy_file, tmp_path, capsys):
     path.write_text(text)
     assert deploy(["--policy", str(policy_file), "--scenario", str(path)]) == 2
     assert re.search(message, capsys.readouterr().err)
+
+
+def test_keys_that_arrive_together_are_all_pressed(monkeypatch):
+    other_end, terminal = os.openpty()
+    tty.setraw(terminal)
+    with os.fdopen(terminal) as stdin:
+        monkeypatch.setattr("sys.stdin", stdin)
+        os.write(other_end, b"w ")
+        assert list(keyboard._pressed()) == ["w", " "]
+        assert list(keyboard._pressed()) == []
+    os.close(other_end)
 
 
 @pytest.mark.parametrize(

@@ -22,6 +22,8 @@ PROTOCOLS = {
                    "--episode-seconds", "0.8"],
     "modulation": [*COMPLIANT, "--onset", "0.5", "--window", "0.0", "0.2", "--fall-seconds", "0.2",
                    "--episode-seconds", "0.8"],
+    "passivity": ["--compared", "cotap", "cotap:passive=true", "--num-envs", "40", "--generations", "1",
+                  "--threads", "1", "--episode-seconds", "0.2", "--settle-seconds", "0.1"],
 }  # fmt: skip
 """All but those that differ from one of these only in the force."""
 

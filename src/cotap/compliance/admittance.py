@@ -68,21 +68,24 @@ class VirtualMass:
         y, rate = position - before - rest, velocity - target_velocity
         natural = (stiffness / self.mass).sqrt()
         decay = self.damping_ratio * natural
-        cosine, sine = self._waves(natural, dt)
-        shrink = torch.exp(-decay * dt)
-        moved = shrink * (y * (cosine + decay * sine) + rate * sine)
-        rate = shrink * (rate * (cosine - decay * sine) - natural.square() * y * sine)
+        cosine, sine = self._waves(natural, decay, dt)
+        moved = y * (cosine + decay * sine) + rate * sine
+        rate = rate * (cosine - decay * sine) - natural.square() * y * sine
         return wanted + rest + moved, target_velocity + rate
 
-    def _waves(self, natural: torch.Tensor, dt: float) -> tuple[torch.Tensor, torch.Tensor]:
-        """`cos(w t)` and `sin(w t) / w` of the damped frequency w, hyperbolic where it is imaginary."""
-        square = 1.0 - self.damping_ratio**2
+    def _waves(self, natural: torch.Tensor, decay: torch.Tensor, dt: float) -> tuple[torch.Tensor, torch.Tensor]:
+        """`cos(w t)` and `sin(w t) / w` of the damped frequency w, hyperbolic where it is imaginary, times
+        `exp(-decay t)`: the hyperbolic ones alone would overflow."""
+        square, shrink = 1.0 - self.damping_ratio**2, torch.exp(-decay * dt)
         if square == 0.0:
-            return torch.ones_like(natural), torch.full_like(natural, dt)
-        damped = math.sqrt(abs(square)) * natural
+            return shrink, shrink * dt
+        root = math.sqrt(abs(square))
+        damped = root * natural
         if square > 0.0:
-            return torch.cos(damped * dt), torch.sin(damped * dt) / damped
-        return torch.cosh(damped * dt), torch.sinh(damped * dt) / damped
+            return shrink * torch.cos(damped * dt), shrink * torch.sin(damped * dt) / damped
+        sum_of_rates = self.damping_ratio + root  # one over their difference, which would lose digits
+        slow, fast = torch.exp(-natural * dt / sum_of_rates), torch.exp(-natural * dt * sum_of_rates)
+        return 0.5 * (slow + fast), 0.5 * (slow - fast) / damped
 
 
 class StaticShift:

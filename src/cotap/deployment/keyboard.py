@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections.abc import Iterator
@@ -66,11 +67,12 @@ class KeyboardPilot:
 def _pressed() -> Iterator[str]:
     import select
 
-    while select.select([sys.stdin], [], [], 0.0)[0]:
-        key = sys.stdin.read(1)
-        if not key:
+    terminal = sys.stdin.fileno()
+    while select.select([terminal], [], [], 0.0)[0]:
+        keys = os.read(terminal, 64)  # not through a buffer, in which `select` would not see them
+        if not keys:
             return
-        yield key
+        yield from keys.decode(errors="ignore")
 
 
 @contextmanager

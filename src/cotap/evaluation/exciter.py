@@ -58,8 +58,8 @@ class Exciters:
         self._ratio, self._shift = natural * 2.0 ** g[:, _RATIO].tanh(), math.pi * g[:, _SHIFT]
         self._depth, self._way, self._far = g[:, _DEPTH].tanh(), g[:, _WAY], g[:, _FAR]
         self._rng = torch.Generator().manual_seed(seed)
-        self._held = torch.zeros(len(g))
-        self._turn = torch.full((len(g),), -1.0)
+        self._held = torch.zeros_like(self._size)
+        self._turn = torch.full_like(self._size, -1.0)
 
     def _pulls(self, time: float) -> torch.Tensor:
         """(N,) bool: it is the turn to pull."""
