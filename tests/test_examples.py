@@ -19,6 +19,7 @@ from cotap.envs.rewards import RewardGroup
 from cotap.evaluation.policy import load_policy
 from cotap.motions import MotionLibrary
 from cotap.robots import h1
+from cotap.train import _base_config
 from examples import own_arm, own_motion, own_reward
 
 ROOT = Path(__file__).parents[1]
@@ -95,12 +96,14 @@ def test_a_reward_of_ones_own_is_paid(make_env):
 
 
 @pytest.mark.usefixtures("in_tmp_path")
-def test_a_training_with_it_makes_a_policy_like_any_other():
+def test_a_training_with_it_makes_a_policy_like_any_other(capsys):
     folder = own_reward.train("run", num_envs=8)
     (checkpoint,) = folder.glob("checkpoint_*.pt")
     weights = load_checkpoint(checkpoint)["config"]["training"]["env"]["rewards"]["lower"]
     assert (weights["foot_speed"], weights["track_height"]) == (-0.05, 1.5)
     assert load_policy(checkpoint).env_config.rewards.lower.track_height == 1.5
+    assert _base_config(str(checkpoint)).env.rewards.lower.track_height == 1.5
+    assert "left out: foot_speed" in "".join(capsys.readouterr())
 
 
 @pytest.mark.slow

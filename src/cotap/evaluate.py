@@ -205,7 +205,7 @@ def run(name: str, options: Options[Protocol]) -> dict[str, Any]:
     if options.plot:
         protocol.plot(Path(options.plot), result)
     if options.video:
-        protocol.video(Path(options.video), sheet_path(options.video), env, policy)
+        protocol.video(Path(options.video), sheet_path(options.video), env)
     return result
 
 

@@ -208,32 +208,36 @@ def _resumed_config(checkpoint: str, recipe: str, stage: str, kind: type[Any]) -
         )
     if recipe:
         raise ValueError(f"--recipe {recipe!r}: the run of --resume goes on with its own config")
-    return _config_of(checkpoint, kind)
+    return _config_of(checkpoint, content, kind)
 
 
 def _base_config(checkpoint: str) -> BaseTraining:
-    """The config of a base policy, for as many samples as it was trained on. Raises CheckpointError for another one."""
-    from cotap.agents.checkpoint import CheckpointError, load_checkpoint, require_parts
+    """The config of a base policy, for as many samples as it was trained on, but for rewards that are not known here.
+    Raises CheckpointError for another one."""
+    from cotap.agents.checkpoint import MALFORMED, CheckpointError, load_checkpoint, require_parts
+    from cotap.agents.run_log import say
+    from cotap.configs.saved import without_unknown_terms
 
     content = load_checkpoint(checkpoint)
-    require_parts(checkpoint, content, ("kind", "layout", "model", "samples"))
+    require_parts(checkpoint, content, ("kind", "layout", "model", "samples", "config"))
     if content["kind"] != "base":
         raise CheckpointError(f"checkpoint {checkpoint!r} is of stage {quoted(content['kind'])}, not 'base'")
-    training = _config_of(checkpoint, BaseTraining)
+    try:
+        plain = content["config"]["training"]
+        plain["env"], unknown = without_unknown_terms(plain["env"])
+    except MALFORMED as error:
+        raise CheckpointError(f"checkpoint {checkpoint!r} has no usable config: {reason_of(error)}") from error
+    if unknown:
+        say(f"{checkpoint}: trained with rewards that are not known here and are left out: {', '.join(unknown)}")
+    training = _config_of(checkpoint, content, BaseTraining)
     training.train_for(content["samples"])
     return training
 
 
-_RETIRED_TERM = "track_height_widely"
-"""A reward that H1's shipped base was trained with; `track_height` alone does its work now."""
+def _config_of(checkpoint: str, content: dict[str, Any], kind: type[Any]) -> Any:
+    from cotap.agents.checkpoint import MALFORMED, CheckpointError
 
-
-def _config_of(checkpoint: str, kind: type[Any]) -> Any:
-    from cotap.agents.checkpoint import MALFORMED, CheckpointError, load_checkpoint
-
-    content = load_checkpoint(checkpoint)
     try:
-        content["config"]["training"]["env"]["rewards"]["lower"].pop(_RETIRED_TERM, None)
         return from_plain(kind, content["config"]["training"])
     except MALFORMED as error:
         raise CheckpointError(f"checkpoint {checkpoint!r} has no usable config: {reason_of(error)}") from error

@@ -119,7 +119,7 @@ def test_without_a_force_the_sent_targets_are_tracked(arms, name):
 def test_a_held_force_moves_the_tracked_hand_by_force_over_stiffness_in_the_heading_frame(arms, name):
     force = torch.tensor([5.0, -10.0, 20.0]).expand(3, 2, 3)
     law, state = LAWS[name](arms, LawConfig(name)), a_state(arms, hand_force_h=force)
-    state = replace(state, fresh=torch.zeros(3, dtype=torch.bool))
+    state = replace(state, fresh=torch.zeros(3, 2, dtype=torch.bool))
     p = parameters()
     p.stiffness = torch.tensor([200.0, 400.0, 800.0]).expand(3, 2, 3)
     for _ in range(300):
@@ -138,7 +138,7 @@ def test_the_matched_composition_splits_the_compliance(arms):
         ("cotap+facet-matched", 0.25, 2400.0, 800.0),
     ):
         law = LAWS[name](arms, LawConfig(name, reference_share=share))
-        state = a_state(arms, hand_force_h=force, fresh=torch.zeros(3, dtype=torch.bool))
+        state = a_state(arms, hand_force_h=force, fresh=torch.zeros(3, 2, dtype=torch.bool))
         for _ in range(200):
             torque, report = law(state, p)
         torch.testing.assert_close(
@@ -159,12 +159,12 @@ def test_model_and_tracking_law_have_the_stiffness_commanded_unless_scaled(arms)
 
 def test_envs_that_begin_anew_forget(arms):
     force = torch.tensor([0.0, 0.0, 50.0]).expand(3, 2, 3)
-    law, old = LAWS["facet"](arms, LawConfig("facet")), torch.zeros(3, dtype=torch.bool)
+    law, old = LAWS["facet"](arms, LawConfig("facet")), torch.zeros(3, 2, dtype=torch.bool)
     for _ in range(50):
         law(a_state(arms, hand_force_h=force, fresh=old), parameters())
     moved = {k: v.clone() for k, v in law.memory.items()}
     law.memory["position_h"][1] = torch.nan  # as of a world that has diverged
-    fresh = torch.tensor([False, True, False])
+    fresh = torch.tensor([False, True, False]).unsqueeze(1).expand(3, 2)
     state = a_state(arms, fresh=fresh)
     law(state, parameters())
     wanted = arms.chains.pose(state.target).tip @ state.to_heading[0].T
@@ -188,7 +188,7 @@ def test_references_move_no_faster_than_joints_can(arms):
 @pytest.mark.parametrize("name", ["facet", "dcc"])
 def test_references_go_on_from_where_they_were_moved_to(arms, name):
     """A shift that takes several steps at the joints' velocity limits gets there, not a step's way and no further."""
-    force, old = torch.tensor([0.0, 0.0, 60.0]).expand(3, 2, 3), torch.zeros(3, dtype=torch.bool)
+    force, old = torch.tensor([0.0, 0.0, 60.0]).expand(3, 2, 3), torch.zeros(3, 2, dtype=torch.bool)
     law, state = LAWS[name](arms, LawConfig(name)), a_state(arms, hand_force_h=force, fresh=old)
     offsets = [torch.zeros_like(state.position)]
     for _ in range(8):

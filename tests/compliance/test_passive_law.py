@@ -36,7 +36,7 @@ def pulled(arms, law, n, steps, command, rng):
     dq, h = torch.zeros_like(q), DT / SUBSTEPS
     mass = joint_inertia(arms.inertias, arms.chains.pose(q))
     upright = torch.eye(3, dtype=q.dtype).expand(n, 3, 3)
-    fresh, drawn, target = torch.ones(n, dtype=torch.bool), torch.zeros(n, 2, dtype=q.dtype), q.clone()
+    fresh, drawn, target = torch.ones(n, 2, dtype=torch.bool), torch.zeros(n, 2, dtype=q.dtype), q.clone()
     p, rows = parameters(n), []
     for step in range(steps):
         command(step, p, q - target, dq)
@@ -161,7 +161,7 @@ def test_a_moving_reference_fills_no_store_by_damping_that_does_not_act(arms):
     for step in range(20):
         state = ArmState(
             q + step * DT * rate, rate, q + (step + 1) * DT * rate, arms.chains.pose(q), upright,
-            target_velocity=rate, fresh=torch.full((n,), step == 0), dt=DT,
+            target_velocity=rate, fresh=torch.full((n, 2), step == 0), dt=DT,
         )  # fmt: skip
         law(state, parameters(n))
         if step == 0:
@@ -181,7 +181,7 @@ def test_arms_that_begin_anew_have_a_full_store_and_what_they_ask_for(arms, rng)
     pulled(arms, law, 3, 60, at_random(rng), rng)
     assert float(law.memory["store"].min()) < 0.1
     q = HOME.double().expand(3, 2, 4)
-    fresh = torch.tensor([True, False, True])
+    fresh = torch.tensor([True, False, True]).unsqueeze(1).expand(3, 2)
     upright = torch.eye(3, dtype=q.dtype).expand(3, 3, 3)
     state = ArmState(q, 0.0 * q, q + 0.5, arms.chains.pose(q), upright, fresh=fresh, dt=DT)
     torque, report = law(state, parameters(3, 1200.0))

@@ -10,14 +10,16 @@ import numpy as np
 import pytest
 import torch
 
+from cotap.agents.actors import as_dict
 from cotap.deployment import tour as in_engine
 from cotap.deployment.tour import evaluate_in_engine
 from cotap.envs import HumanoidEnv
 from cotap.evaluate import main
 from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.policy import load_policy
+from cotap.evaluation.rollout import acting
 from cotap.evaluation.tour.arm_walk import arms_at
-from cotap.evaluation.tour.protocol import Tour
+from cotap.evaluation.tour.protocol import Tour, _pelvis
 
 SHIPPED_ROBOTS = ["h1", "g1"]
 
@@ -98,6 +100,38 @@ def test_arms_have_the_walk_and_its_gains_whatever_the_policy_asks(checkpoint_of
         np.testing.assert_allclose(
             np.diag(law.stiffness)[: upper.start], [j.kp for j in env.spec.joints[: upper.start]]
         )
+
+
+def asked(what: in_engine.Controller | HumanoidEnv) -> torch.Tensor:
+    """(1, 3) velocity and yaw rate that are commanded now."""
+    command = what.commands.current()
+    return torch.cat((command.velocity_h, command.yaw_rate[:, None]), 1)
+
+
+def test_what_is_asked_for_is_seen_a_step_later_as_in_the_batch(checkpoint_of, monkeypatch):
+    checkpoint = checkpoint_of()
+    seen: list[torch.Tensor] = []
+    step = in_engine.Controller.step
+
+    def stepping(controller, readings):
+        law = step(controller, readings)
+        seen.append(asked(controller))
+        return law
+
+    monkeypatch.setattr(in_engine.Controller, "step", stepping)
+    tour, env = prepared(checkpoint, num_envs=1)
+    tour.engine = "mujoco"
+    evaluate_in_engine(tour, checkpoint, env.cfg)
+    expected = []
+    obs, policy = tour._begin(env), load_policy(checkpoint)
+    act = acting(env, policy, tour.upper_actions)
+    for k in range(2):
+        expected.append(asked(env))
+        tour._ask(env, *tour.pilot.command(k * env.dt, *_pelvis(env), env.state.heading_w))
+        obs, *_ = env.step(act(as_dict(obs)))
+    assert not expected[0].any()
+    assert expected[1].any()
+    torch.testing.assert_close(torch.stack(seen[:2]), torch.stack(expected), atol=1e-5, rtol=0)
 
 
 def test_the_policy_s_upper_actions_can_be_had(checkpoint_of, steps):

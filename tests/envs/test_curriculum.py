@@ -108,6 +108,14 @@ def test_arms_move_less_while_many_fall():
     assert curriculum.arm_motion == 0.0
 
 
+def test_arms_that_are_asked_to_move_wholly_do_so_whatever_they_did_before():
+    curriculum = Curriculum(CurriculumConfig(), dt=1.0)
+    curriculum.load_state_dict({"samples": 5, "falls_per_s": 0.0, "arm_motion": 0.8})
+    curriculum.step(torch.zeros(4, dtype=torch.bool), 4)
+    curriculum.step(torch.zeros(4, dtype=torch.bool), 4)
+    assert (curriculum.arm_motion, curriculum.samples) == (1.0, 9)
+
+
 def test_arms_move_wholly_where_nothing_else_is_asked_for():
     curriculum = Curriculum(CurriculumConfig(), dt=1.0)
     for _ in range(9):

@@ -324,10 +324,10 @@ def test_a_restarted_env_has_no_law_from_before(make_env, robot):
     drive(env, 3)
     knock_over(env, 1)
     env.step(zeros(env))
-    assert env.upper_body.fresh.tolist() == [False, True]
+    assert env.upper_body.fresh.tolist() == [[False] * 2, [True] * 2]
     assert not env.torque[1].any()
     drive(env, 1)
-    assert env.upper_body.fresh.tolist() == [False, False]
+    assert env.upper_body.fresh.tolist() == [[False] * 2] * 2
     for name in env.upper_body.PAIRED:
         before, newest = getattr(env.upper_body, name)
         assert torch.equal(before[1], newest[1])
@@ -384,3 +384,16 @@ def test_a_store_is_an_arms_own_logged_and_saved(make_env):
     assert torch.equal(*levels)
     env.set_law(0, 0, LawConfig("cotap"))
     assert env.upper_body.report == {}
+
+
+def test_an_arm_under_another_law_leaves_the_other_arm_its_memory(make_env):
+    env = make_env(2, upper_body=both(LawConfig("cotap", passive=True, store_energy=1.0)))
+    drive(env, 2)
+    (law,) = env.upper_body._remembering()
+    law.memory["store"][:] = 0.25
+    env.set_law(0, 0, LawConfig("cotap", passive=True, store_energy=0.5))
+    drive(env, 1)
+    assert env.upper_body.report["store_energy"].tolist() == [
+        [pytest.approx(0.5), pytest.approx(0.25, abs=0.2)],
+        [pytest.approx(0.25, abs=0.2)] * 2,
+    ]

@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from cotap.configs import to_plain
 from cotap.envs import HumanoidEnvConfig
 from cotap.evaluate import evaluate, main
 from cotap.evaluation.policy import load_policy, shipped_checkpoint, shipped_names
@@ -108,33 +107,6 @@ def test_outputs_that_cannot_be_are_found_before_the_work(
 def test_plot_is_written(tmp_path: Path, checkpoint: Path):
     run(tmp_path, checkpoint, "--plot", str(tmp_path / "plot.png"))
     assert (tmp_path / "plot.png").read_bytes()[:4] == b"\x89PNG"
-
-
-@pytest.mark.slow
-def test_the_video_is_of_the_laws_that_were_asked_for(
-    tmp_path: Path, checkpoint: Path, monkeypatch: pytest.MonkeyPatch
-):
-    filmed = []
-    monkeypatch.setattr("cotap.evaluation.render.tour_video", lambda _path, cfg, *_: filmed.append(cfg.upper_body))
-    options = ("--num-envs", "2", "--episode-seconds", "5", "--method", "cotap", "--singularity-ratio", "False")
-    result = run(tmp_path, checkpoint, *options, "--video", str(tmp_path / "tour.mp4"))
-    assert to_plain(filmed[0]) == result["settings"]["env"]["upper_body"]
-    assert not filmed[0].singularity_ratio
-
-
-@pytest.mark.slow
-def test_the_tour_is_filmed_with_the_arms_as_they_were_evaluated(
-    tmp_path: Path, checkpoint: Path, monkeypatch: pytest.MonkeyPatch
-):
-    filmed = []
-    monkeypatch.setattr("cotap.evaluation.render.tour_video", lambda *args: filmed.append(args[-2:]))
-    options = ("--num-envs", "2", "--episode-seconds", "5", "--video", str(tmp_path / "tour.mp4"))
-    run(tmp_path, checkpoint, *options)
-    run(tmp_path, checkpoint, *options, "--motion", "none", "--arm-pose", "0.1", "0.2", "0.3", "0.4")
-    run(tmp_path, checkpoint, *options, "--upper-actions", "reference")
-    assert filmed[0] == (None, "policy")
-    assert filmed[2] == (None, "reference")
-    assert filmed[1][0].tolist() == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.1, -0.2, -0.3, 0.4])
 
 
 @pytest.mark.slow

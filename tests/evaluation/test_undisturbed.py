@@ -35,6 +35,13 @@ def test_a_protocol_is_the_same_whatever_the_training_had_on(protocol):
     assert to_plain(protocol().configure(lively())) == to_plain(protocol().configure(bare))
 
 
+@pytest.mark.parametrize("protocol", [p for name, p in PROTOCOLS.items() if name != "tour"])
+def test_quicker_controllers_are_late_by_a_step_of_theirs_at_most(protocol):
+    cfg = protocol().configure(HumanoidEnvConfig(control_dt=0.01))
+    cfg.check()
+    assert cfg.randomization.delay_s == (0.0, 0.01)
+
+
 @pytest.mark.parametrize("name", PROTOCOLS)
 def test_what_a_protocol_asks_for_is_there(name):
     cfg = PROTOCOLS[name]().configure(lively())

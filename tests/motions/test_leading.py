@@ -10,7 +10,7 @@ from cotap.motions.reference import REST, ReferenceConfig, ReferenceMotion
 DT = 0.02
 
 
-def led(m: ReferenceMotion, motion: str, rng: torch.Generator, steps: int = 150) -> torch.Tensor:
+def led(m: ReferenceMotion, motion: str, rng: torch.Generator, steps: int = 300) -> torch.Tensor:
     """Positions (T, N, U) of `steps` control steps under the lead of `motion`."""
     m.lead(motion)
     positions = []

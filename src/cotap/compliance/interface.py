@@ -75,7 +75,7 @@ class ArmState:
     target_velocity: torch.Tensor | None = None
     """(N, A, n) how fast the reference moves [rad/s]; None counts as at rest."""
     fresh: torch.Tensor | None = None
-    """(N,) bool: the episode has just begun and nothing is remembered; None counts as everywhere."""
+    """(N, A) bool: the arm's law or its episode has just begun and nothing is remembered; None counts as everywhere."""
     dt: float = 0.02
     """Control step [s]."""
 
@@ -124,17 +124,17 @@ class UpperBodyLaw(Protocol):
 
 
 class Remembering:
-    """Base of laws that carry something from step to step: tensors with the envs in front, in `memory` by name.
+    """Base of laws that carry something from step to step: tensors (N, A, ...), in `memory` by name.
 
-    Whoever asks a law saves its memory with everything else, and marks envs that begin anew as fresh.
+    Whoever asks a law saves its memory with everything else, and marks arms that begin anew as fresh.
     """
 
     def __init__(self) -> None:
         self.memory: dict[str, torch.Tensor] = {}
 
     def recall(self, state: ArmState, name: str, initial: torch.Tensor) -> torch.Tensor:
-        """What was remembered under `name`, and `initial` (N, ...) in envs that are fresh."""
+        """What was remembered under `name`, and `initial` (N, A, ...) of arms that are fresh."""
         held = self.memory.get(name)
         if held is None or state.fresh is None:
             return initial
-        return torch.where(state.fresh.reshape(-1, *[1] * (initial.dim() - 1)), initial, held)
+        return torch.where(state.fresh[(..., *[None] * (initial.dim() - 2))], initial, held)

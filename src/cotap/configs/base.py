@@ -23,8 +23,6 @@ from cotap.envs.hand_loads import HandLoadConfig
 from cotap.envs.observations import ObservationConfig
 from cotap.envs.pushes import PushConfig
 from cotap.envs.rewards import UpperRewards
-from cotap.motions.generator import MotionConfig
-from cotap.motions.reference import ClipConfig, ReferenceConfig
 
 
 @dataclass
@@ -63,9 +61,6 @@ def default() -> BaseTraining:
         env=HumanoidEnvConfig(
             num_envs=1024,
             actions=ActionConfig(waist_share=0.5),
-            motions=ReferenceConfig(
-                clips=ClipConfig(acceleration=40.0, blend_speed=0.12), generator=MotionConfig(largest_speed=4.5)
-            ),
             assist=AssistConfig(enabled=True),
             curriculum=CurriculumConfig(arm_motion_samples=3e6),
             forces=ExternalForceConfig(

@@ -102,8 +102,9 @@ def _run(
     film: list[torch.Tensor] = []
     for step in range(tour.waypoints * tour.segment_steps):
         time_s = step * CONTROL_S
-        _ask(controller, *pilot.command(time_s, *_pelvis(robot), robot.truth().heading_w), robot.spec)
+        asked = pilot.command(time_s, *_pelvis(robot), robot.truth().heading_w)
         law, blows = controller.step(robot.read()), []
+        _ask(controller, *asked, robot.spec)  # seen at the next step, as in batched MuJoCo
         if punches.active:
             joint, force_w = (part[0] for part in punches.at(torch.tensor([time_s])))
             link = links[robot.spec.joint_names[joint]]

@@ -81,6 +81,8 @@ class Curriculum:
         if self._cfg.arm_motion_samples > 0.0:
             change = samples / self._cfg.arm_motion_samples
             self.arm_motion = min(1.0, max(0.0, self.arm_motion + (-change if many else change)))
+        else:
+            self.arm_motion = 1.0
 
     def state_dict(self) -> dict[str, float]:
         """What goes on from step to step."""

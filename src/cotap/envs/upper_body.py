@@ -130,7 +130,7 @@ class UpperBody(Stateful):
             torch.tensor([c.alpha for c in configs], dtype=dtype).repeat(n, 1),
         )
         self.modulation = Modulation(cfg.modulation, configs, dt, dtype)
-        self.fresh = torch.ones(n, dtype=torch.bool)
+        self.fresh = torch.ones(n, a, dtype=torch.bool)
         # Two torque laws, the one in force and the one before it: (2, N, A, n[, n]).
         self._anchor, self._feedforward, self._elastic = (torch.zeros(2, n, a, j, dtype=dtype) for _ in range(3))
         self._stiffness, self._damping = (torch.zeros(2, n, a, j, j, dtype=dtype) for _ in range(2))
@@ -160,7 +160,7 @@ class UpperBody(Stateful):
         self.report = {}
         self._laws = {kind: driven for kind, driven in self._laws.items() if driven[2].any()}
         self.sensors.estimates = any(config.sensing == "estimated" for _, config, _ in self._laws.values())
-        self.fresh[env] = True
+        self.fresh[env, arm] = True
 
     @property
     def active(self) -> bool:
@@ -181,7 +181,7 @@ class UpperBody(Stateful):
 
     def reset(self, mask: torch.Tensor, rng: torch.Generator) -> None:
         """The next command of the envs in `mask` has none before it; their parameters begin anew."""
-        self.fresh = self.fresh | mask
+        self.fresh = self.fresh | mask.unsqueeze(1)
         self.sensors.reset(mask)
         self.modulation.reset(self.parameters, mask)
         if self._cfg.sampling.enabled:
@@ -228,7 +228,7 @@ class UpperBody(Stateful):
         tensors = (new.anchor, new.feedforward, new.elastic, new.stiffness, new.damping)
         for name, value in zip(self.PAIRED, tensors, strict=True):
             held: torch.Tensor = getattr(self, name)
-            before = torch.where(self.fresh.reshape(-1, *[1] * (value.dim() - 1)), value, held[1])
+            before = torch.where(self.fresh[(..., *[None] * (value.dim() - 2))], value, held[1])
             setattr(self, name, torch.stack((before, value)))
         self.fresh = torch.zeros_like(self.fresh)
 

@@ -69,7 +69,7 @@ def linearize(
     law, joints, num_arms = make(arms), q.shape[2], q.shape[1]
     upright = torch.eye(3, dtype=q.dtype).expand(len(q), 3, 3)
     rest, none = torch.zeros_like(q), torch.zeros(*q.shape[:2], 3, dtype=q.dtype)
-    beginning, later = torch.ones(len(q), dtype=torch.bool), torch.zeros(len(q), dtype=torch.bool)
+    beginning, later = torch.ones(q.shape[:2], dtype=torch.bool), torch.zeros(q.shape[:2], dtype=torch.bool)
 
     def ask(at: torch.Tensor, rate: torch.Tensor, force: torch.Tensor, memory: dict[str, torch.Tensor] | None):
         """The law's answer, and what it remembers of it, (N, A, k)."""

@@ -20,9 +20,9 @@ from cotap.agents.checkpoint import (
     require_parts,
 )
 from cotap.checks import quoted, reason_of, require_one_of, require_positive_int
-from cotap.configs import from_plain, to_plain
+from cotap.configs import from_plain
+from cotap.configs.saved import without_unknown_terms
 from cotap.envs import HumanoidEnvConfig
-from cotap.envs.config import RewardConfig
 
 CHECKPOINTS = ("h1-base", "h1-cotap", "g1-base", "g1-cotap")
 """Names under which policies are shipped: robot and stage."""
@@ -126,7 +126,8 @@ def _require_fitting(networks: AgentLayout, layout: dict[str, Any]) -> None:
 
 def _env_config_of(path: Path | str, content: dict[str, Any]) -> HumanoidEnvConfig:
     try:
-        cfg = from_plain(HumanoidEnvConfig, _without_own_terms(content["config"]["training"]["env"]))
+        env, _ = without_unknown_terms(content["config"]["training"]["env"])  # here nobody is paid
+        cfg = from_plain(HumanoidEnvConfig, env)
         cfg.backend = "auto"  # the one it was trained on may not be installed here
         cfg.check()
     except MALFORMED as error:
@@ -134,17 +135,3 @@ def _env_config_of(path: Path | str, content: dict[str, Any]) -> HumanoidEnvConf
             f"checkpoint {str(path)!r} has no usable environment config: {reason_of(error)}"
         ) from error
     return cfg
-
-
-def _without_own_terms(env: Any) -> Any:
-    """An environment's config as it was saved, without weights of rewards that only the script of a training knew: here
-    nobody is paid. What is malformed is left to whoever reads it."""
-    known = to_plain(RewardConfig())
-    try:
-        rewards = {
-            agent: {term: weight for term, weight in weights.items() if term in known[agent]}
-            for agent, weights in env["rewards"].items()
-        }
-        return env | {"rewards": rewards}
-    except MALFORMED:
-        return env

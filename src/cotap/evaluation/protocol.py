@@ -65,7 +65,8 @@ class Protocol(ABC):
         self.check()
         disable_disturbances(env_cfg)
         env_cfg.num_envs, env_cfg.seed, env_cfg.torque_limit_scale = self.num_envs, self.seed, self.torque_limit_scale
-        env_cfg.randomization = RandomizationConfig(enabled=self.randomize)
+        late = min(RandomizationConfig().delay_s[1], env_cfg.control_dt)
+        env_cfg.randomization = RandomizationConfig(enabled=self.randomize, delay_s=(0.0, late))
         env_cfg.terminations = TerminationConfig(episode_s=1e6)  # what ends an episode is a fall
         if self.arms == "held":
             select_motion(env_cfg.motions.clips, (HELD,), "")
@@ -87,7 +88,7 @@ class Protocol(ABC):
     def plot(self, path: Path, result: dict[str, Any]) -> None:
         """Draw the result, as a PNG file."""
 
-    def video(self, path: Path, sheet: Path, env: HumanoidEnv, policy: PolicyFunction) -> None:  # noqa: ARG002
+    def video(self, path: Path, sheet: Path, env: HumanoidEnv) -> None:
         """Write a video of the first env as it was evaluated, and a contact sheet."""
         from cotap.evaluation.render import film_video
 

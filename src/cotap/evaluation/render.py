@@ -12,27 +12,13 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from cotap.agents.actors import as_dict
 from cotap.checks import reason_of
-from cotap.envs import HumanoidEnv, HumanoidEnvConfig
+from cotap.envs import HumanoidEnv
 from cotap.evaluation.ray_renderer import RayRenderer
-from cotap.evaluation.rollout import PolicyFunction, acting
-from cotap.evaluation.undisturbed import disable_disturbances
 from cotap.files import write_atomically
 from cotap.robots import RobotSpec
 from cotap.robots.mjcf import build_model
 
-# Seconds, forward velocity, sideways velocity, yaw rate, stand, height offset.
-TOUR = (
-    (2.0, 0.0, 0.0, 0.0, True, 0.0),
-    (4.0, 0.8, 0.0, 0.0, False, 0.0),
-    (3.0, 0.5, 0.0, 0.7, False, 0.0),
-    (3.0, 0.0, 0.4, 0.0, False, 0.0),
-    (3.0, -0.5, 0.0, 0.0, False, 0.0),
-    (2.0, 0.0, 0.0, 0.0, True, 0.0),
-    (3.0, 0.0, 0.0, 0.0, True, -0.2),
-)
-"""A short tour of everything that the base policy is asked to do."""
 STRIDE = 2
 """Control steps from one picture of a film to the next."""
 
@@ -174,39 +160,3 @@ def contact_sheet(path: Path, frames: list[np.ndarray], columns: int) -> None:
     padded = frames + [blank] * (-len(frames) % columns)
     rows = [np.concatenate(padded[i : i + columns], 1) for i in range(0, len(padded), columns)]
     write_atomically(path, lambda p: imageio.imwrite(p, np.concatenate(rows, 0), format="png"))  # pyright: ignore
-
-
-def record_tour(
-    cfg: HumanoidEnvConfig, policy: PolicyFunction, arm_pose: torch.Tensor | None = None, seed: int = 0,
-    upper_actions: str = "policy",
-) -> tuple[HumanoidEnv, torch.Tensor]:  # fmt: skip
-    """One nominal robot on the tour, its arms held at `arm_pose` (U,) if there is one; `upper_actions` as `acting` has
-    them. Returns the environment and its `qpos` (T, nq) at every control step."""
-    disable_disturbances(cfg)
-    cfg.num_envs, cfg.seed, cfg.backend = 1, seed, "mujoco"
-    cfg.terminations.episode_s = 1e4
-    env = HumanoidEnv(cfg)
-    if arm_pose is not None:
-        env.motions.hold(arm_pose)
-    act = acting(env, policy, upper_actions)
-    rows: list[torch.Tensor] = []
-    nominal = env.spec.nominal_height_m
-    obs = env.get_observations()
-    for seconds, vx, vy, yaw, stand, offset in TOUR:
-        env.commands.override(
-            torch.tensor([[vx, vy]]), torch.tensor([yaw]), torch.tensor([stand]), torch.tensor([nominal + offset])
-        )
-        for _ in range(round(seconds / env.dt)):
-            obs, _, _, _ = env.step(act(as_dict(obs)))
-            rows.append(env.sim.qpos[0].clone())
-    return env, torch.stack(rows)
-
-
-def tour_video(
-    path: Path, cfg: HumanoidEnvConfig, policy: PolicyFunction, sheet: Path | None = None,
-    arm_pose: torch.Tensor | None = None, upper_actions: str = "policy",
-) -> None:  # fmt: skip
-    """Write a video (and a contact sheet) of the tour; see `record_tour`."""
-    env, qpos = record_tour(cfg, policy, arm_pose, upper_actions=upper_actions)
-    part = qpos[::STRIDE]
-    write_film(path, render_frames(env.spec, part), len(part), env.dt, sheet)

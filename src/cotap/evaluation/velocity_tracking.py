@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,9 +13,9 @@ from cotap.checks import require_one_of, require_range
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.hand_loads import HandLoadConfig
 from cotap.evaluation.metrics import summaries, tracking_measures, tracking_slopes
-from cotap.evaluation.protocol import RolloutProtocol, mirrored_pose
+from cotap.evaluation.protocol import RolloutProtocol
 from cotap.evaluation.report import plot_tracking
-from cotap.evaluation.rollout import PolicyFunction, Trajectory
+from cotap.evaluation.rollout import Trajectory
 from cotap.robots.mjcf import COLLISIONS
 
 
@@ -102,10 +101,3 @@ class VelocityTracking(RolloutProtocol):
     def plot(self, path: Path, result: dict[str, Any]) -> None:
         """Commanded against measured velocity, and heights in stance."""
         plot_tracking(path, self.trajectory, result["settings"]["env"]["gait"]["period_s"], self.settle_seconds)
-
-    def video(self, path: Path, sheet: Path, env: HumanoidEnv, policy: PolicyFunction) -> None:
-        """Write a video of one robot under a series of commands, and a contact sheet."""
-        from cotap.evaluation.render import tour_video
-
-        pose = mirrored_pose(env, self.arm_pose) if self.arms == "held" else None
-        tour_video(path, copy.deepcopy(env.cfg), policy, sheet, pose, self.upper_actions)

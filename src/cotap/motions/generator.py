@@ -33,7 +33,7 @@ class MotionConfig:
     """Weight of both arms swinging in opposition, as in walking."""
     velocity_share: float = 0.5
     """Fastest reference, as a share of each joint's velocity limit."""
-    largest_speed: float = 10.0
+    largest_speed: float = 4.5
     """Fastest reference of any joint [rad/s]: limits that hold without a load say little of what an arm can follow."""
     limit_margin_rad: float = 0.1
     """Distance kept from joint limits [rad]."""

@@ -44,13 +44,13 @@ class ClipConfig:
     """Clips kept out, for evaluation. Names that a library of one's own lacks are ignored."""
     velocity_share: float = 0.5
     """Fastest playing, as a share of each joint's velocity limit; faster passages are slowed down."""
-    acceleration: float = 100.0
+    acceleration: float = 40.0
     """Largest joint acceleration in playing [rad/s^2]; the same."""
     hold_s: tuple[float, float] = (4.0, 10.0)
     """Time before another motion is drawn [s]."""
     blend_s: float = 0.3
     """Shortest time of a transition from one motion to another [s]."""
-    blend_speed: float = 0.5
+    blend_speed: float = 0.12
     """Fastest transition, as a share of each joint's velocity limit."""
 
     def check(self) -> None:

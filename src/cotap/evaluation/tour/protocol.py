@@ -194,7 +194,7 @@ class Tour(Protocol):
             axis.grid(alpha=0.2)
         report.save_figure(figure, path)
 
-    def video(self, path: Path, sheet: Path, env: HumanoidEnv, policy: PolicyFunction) -> None:  # noqa: ARG002
+    def video(self, path: Path, sheet: Path, env: HumanoidEnv) -> None:
         """Write a video of the first run, with its waypoints and punches, and a contact sheet."""
         from cotap.evaluation.render import STRIDE, film_video
         from cotap.evaluation.tour.film import TourMarks
