@@ -23,6 +23,7 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
+from cotap.evaluation.report import pyplot
 
 FOREVER = 10**9
 RATE = "throughput/steps_per_s"
@@ -142,10 +143,7 @@ def trend(values: np.ndarray, seed: int = 0) -> tuple[float, list[float]]:
 
 def plot(path: Path, soaked: Soaked) -> None:
     """Memory and throughput over time, and throughput over that of the reference."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    plt = pyplot()
 
     rows = 3 if len(soaked.pauses) else 2
     figure, axes = plt.subplots(rows, 1, figsize=(9, 2.4 * rows), constrained_layout=True, sharex=True)

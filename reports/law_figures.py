@@ -6,12 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from cotap.evaluation.report import pyplot
+
 
 def _pyplot() -> Any:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    plt = pyplot()
 
     return plt
 

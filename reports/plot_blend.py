@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 
 from cotap.compliance import modulate_stiffness
+from cotap.evaluation.report import pyplot
 
 STEPS = 7
 
@@ -24,10 +25,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("output", nargs="?", type=Path, default=Path("docs/blend.png"))
     path = parser.parse_args().output
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    plt = pyplot()
 
     turn = torch.tensor([[0.8, -0.6], [0.6, 0.8]], dtype=torch.float64)
     compliant = turn @ torch.diag(torch.tensor([1.0, 0.1], dtype=torch.float64)) @ turn.T

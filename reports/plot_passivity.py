@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from cotap.compliance import EnergyStore, damping_energy, hold_back, spd_exp, spd_log, stiffness_energy
+from cotap.evaluation.report import pyplot
 
 DT, SECONDS, SUBSTEPS = 0.02, 4.0, 20
 MASS_KG, DAMPING, SOFT, STIFF = 1.0, 2.0, 100.0, 600.0
@@ -96,10 +97,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("output", nargs="?", type=Path, default=Path("docs/passivity.png"))
     path = parser.parse_args().output
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    plt = pyplot()
 
     figure, axes = plt.subplots(1, 3, figsize=(12.0, 3.2), constrained_layout=True)
     draw(axes)

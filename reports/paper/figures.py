@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from cotap.evaluation.report import pyplot
 from reports.paper.book import Book
 
 Shot = tuple[str, list[str], tuple[float, ...]]
@@ -52,10 +53,7 @@ def draw_pictures(book: Book, name: str, caption: str, shots: Iterable[Shot]) ->
 
 
 def _axes(columns: int, size: tuple[float, float] = (7.5, 4.2)) -> tuple[Any, Any]:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    plt = pyplot()
 
     figure, axes = plt.subplots(1, columns, figsize=size, constrained_layout=True, squeeze=False)
     return figure, axes[0]

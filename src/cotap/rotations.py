@@ -25,13 +25,18 @@ def quat_about_z(yaw: torch.Tensor) -> torch.Tensor:
 
 
 def rotate(matrix: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
-    """`matrix @ vector` for (..., 3, 3) and (..., 3)."""
+    """`matrix @ vector` for (..., m, n) and (..., n)."""
     return (matrix * vector.unsqueeze(-2)).sum(-1)
 
 
 def rotate_inverse(matrix: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
     """`matrix^T @ vector` for (..., 3, 3) and (..., 3)."""
     return (matrix * vector.unsqueeze(-1)).sum(-2)
+
+
+def yaw_of(matrix_w: torch.Tensor) -> torch.Tensor:
+    """Yaw (...) [rad] of orientations (..., 3, 3)."""
+    return torch.atan2(matrix_w[..., 1, 0], matrix_w[..., 0, 0])
 
 
 def heading_matrix(matrix_w: torch.Tensor) -> torch.Tensor:

@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from cotap.envs.commands import CommandConfig
-from cotap.evaluation.tour.route import Pilot, draw_waypoints, yaw_of
+from cotap.evaluation.tour.route import Pilot, draw_waypoints
+from cotap.rotations import yaw_of
 
 WIDE = CommandConfig((-9.0, 9.0), (-9.0, 9.0), (-9.0, 9.0))
 

@@ -21,6 +21,7 @@ from cotap.compliance.interface import (
     UpperBodyLaw,
 )
 from cotap.compliance.inverse_kinematics import ArmIK
+from cotap.rotations import rotate
 
 
 class HandModel(Protocol):
@@ -130,9 +131,9 @@ class AdmittanceLaw(Remembering):
     def __call__(self, state: ArmState, parameters: LawParameters) -> tuple[TorqueLaw, LawReport]:
         """The tracking law's torque for the moved targets."""
         to_heading = state.to_heading.unsqueeze(1)
-        wanted_h = _rotate(to_heading, self._arms.chains.pose(state.target).tip)
+        wanted_h = rotate(to_heading, self._arms.chains.pose(state.target).tip)
         position_h = self._move(state, wanted_h, self._model_scale * parameters.stiffness)
-        target, error = self._reach(state, _rotate(to_heading.transpose(-1, -2), position_h))
+        target, error = self._reach(state, rotate(to_heading.transpose(-1, -2), position_h))
         scaled = replace(parameters, stiffness=self._tracking_scale * parameters.stiffness)
         torque, report = self._tracking(replace(state, target=target), scaled)
         own = {"reference_shift": (position_h - wanted_h).norm(dim=-1), "ik_error": error}
@@ -157,8 +158,3 @@ class AdmittanceLaw(Remembering):
         solution = self._ik(tip_t, state.target, state.target + held, state.dt * self._arms.speed)
         self.memory["offset"] = solution.position - state.target
         return solution.position, solution.error
-
-
-def _rotate(matrix: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
-    """`matrix vector` for (N, 1, 3, 3) and (N, A, 3)."""
-    return (matrix * vector.unsqueeze(-2)).sum(-1)

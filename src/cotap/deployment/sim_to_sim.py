@@ -36,6 +36,7 @@ from cotap.evaluation.law_options import parse_law
 from cotap.evaluation.metrics import summarize, tracking_measures, wilson_interval
 from cotap.evaluation.periodic import amplitude as swing_amplitude
 from cotap.evaluation.periodic import elbow_joints
+from cotap.evaluation.report import pyplot
 from cotap.motions.elbow import elbow_index
 from cotap.robots import RobotSpec
 
@@ -252,7 +253,7 @@ def statics(spec: RobotSpec, laws: UpperBodyConfig, qpos: np.ndarray, force_z: f
     body = UpperBody(laws, spec, 1, HumanoidEnvConfig().control_dt, torch.float64)
     arms = state.joint_pos[:, len(spec.lower_joints) :]
     body.send(state, arms, torch.zeros_like(arms))
-    to_heading = state.heading_w.transpose(1, 2) @ state.torso_rotation_w
+    to_heading = state.torso_to_heading
     jacobian = (to_heading.unsqueeze(1) @ reader.arm_chains.jacobian(state.arms))[0]
     compliance = jacobian @ torch.linalg.inv(body.newest.stiffness[0]) @ jacobian.transpose(-1, -2)
     elbows = [elbow_index(spec, arm) for arm in spec.arms]
@@ -310,10 +311,7 @@ def _mean(m: dict[str, Any]) -> str:
 
 def figure(result: dict[str, Any], path: Any) -> None:
     """Impact, constant load and periodic load over time, and falls under perturbations, as a picture."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    plt = pyplot()
 
     engines = result["engines"]
     fig, axes = plt.subplots(3, len(engines), figsize=(4.6 * len(engines), 9.0), constrained_layout=True, squeeze=False)

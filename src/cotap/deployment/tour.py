@@ -21,11 +21,12 @@ from cotap.envs.punches import Punches
 from cotap.envs.terminations import diverged
 from cotap.evaluation.tour.arm_walk import arms_at
 from cotap.evaluation.tour.protocol import CONTROL_S, PHYSICS_S, Tour
-from cotap.evaluation.tour.route import Pilot, yaw_of
+from cotap.evaluation.tour.route import Pilot
 from cotap.evaluation.tour.scores import TourMeasures
 from cotap.evaluation.tour.stance import TourStance
 from cotap.motions.generator import ArmReference
 from cotap.robots import RobotSpec
+from cotap.rotations import yaw_of
 
 
 class _Walk:

@@ -138,7 +138,7 @@ def _row(
         "arm_torque": torque[:, first:],
         "arm_torque_share": torque[:, first:].abs() / limit,
         "arm_static_torque": arm_static_torque(controller.upper_body.arms, s, force_w),
-        "hand_offset": offset_t @ (s.heading_w.transpose(1, 2) @ s.torso_rotation_w).transpose(1, 2),
+        "hand_offset": offset_t @ s.torso_to_heading.transpose(1, 2),
         "hand_error": offset_t.norm(dim=2),
         "foot_contact": s.foot_contact,
         "foot_speed": s.foot_velocity_w[:, :, :2].norm(dim=2),

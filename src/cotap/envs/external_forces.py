@@ -109,7 +109,7 @@ class ExternalForces:
         xfrc.zero_()
         hands_h = torch.zeros_like(self.hand_force_w)
         if self._cfg.hand_loads.enabled:
-            to_heading = s.heading_w.transpose(1, 2) @ s.torso_rotation_w
+            to_heading = s.torso_to_heading
             jacobian_h = to_heading.unsqueeze(1) @ self._chains.jacobian(s.arms)
             hands_h = self.hand_loads.current(jacobian_h, self._torque_limit, samples)
         if self.scripted.active:

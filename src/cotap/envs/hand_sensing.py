@@ -55,7 +55,7 @@ class HandSensors(Stateful):
         self.privileged = force_w @ state.heading_w
         if not self.estimates:
             return
-        to_heading = state.heading_w.transpose(1, 2) @ state.torso_rotation_w
+        to_heading = state.torso_to_heading
         pose = self._arms.chains.pose(q)
         momentum = (joint_inertia(self._arms.inertias, pose) @ dq.unsqueeze(-1)).squeeze(-1)
         gravity = gravity_torque(self._arms.inertias, pose, to_heading[:, 2])

@@ -10,7 +10,7 @@ import torch
 
 from cotap.checks import require_range
 from cotap.persistence import Stateful
-from cotap.rotations import rotate_inverse
+from cotap.rotations import rotate_inverse, yaw_of
 
 
 @dataclass
@@ -100,7 +100,7 @@ class PathFollower(Stateful):
         self.impedance.reset(mask)
         self.active[mask] = torch.rand(int(mask.sum()), generator=rng, device=rng.device) < self.cfg.share
         self.target_w = torch.where(mask.unsqueeze(1), position_w, self.target_w)
-        self.heading = torch.where(mask, _yaw(heading_w), self.heading)
+        self.heading = torch.where(mask, yaw_of(heading_w), self.heading)
 
     def step(
         self, position_w: torch.Tensor, heading_w: torch.Tensor, root_velocity: torch.Tensor
@@ -120,7 +120,7 @@ class PathFollower(Stateful):
         self.target_w = self.target_w + self._dt * velocity_w
         self.heading = self.heading + self._dt * path[:, 2]
         velocity = self.impedance.step(position_w, heading_w, self.target_w, velocity_w)
-        error = (self.heading - _yaw(heading_w) + math.pi).remainder(2.0 * math.pi) - math.pi
+        error = (self.heading - yaw_of(heading_w) + math.pi).remainder(2.0 * math.pi) - math.pi
         return velocity, (path[:, 2] + cfg.yaw_gain * error).clamp(-cfg.yaw_rate_limit, cfg.yaw_rate_limit)
 
     def state_dict(self) -> dict[str, Any]:
@@ -132,7 +132,3 @@ class PathFollower(Stateful):
         own = dict(state)
         self.impedance.load_state_dict(own.pop("impedance", {}))
         super().load_state_dict(own)
-
-
-def _yaw(heading_w: torch.Tensor) -> torch.Tensor:
-    return torch.atan2(heading_w[:, 1, 0], heading_w[:, 0, 0])

@@ -68,6 +68,11 @@ class RobotState:
         return self.torso_pos_w[:, 2]
 
     @property
+    def torso_to_heading(self) -> torch.Tensor:
+        """(N, 3, 3) rotation from the torso's frame to the heading frame."""
+        return self.heading_w.transpose(1, 2) @ self.torso_rotation_w
+
+    @property
     def hand_pos_w(self) -> torch.Tensor:
         """(N, A, 3) where the hand points are [m]."""
         return self.torso_pos_w.unsqueeze(1) + self.arms.tip @ self.torso_rotation_w.transpose(1, 2)

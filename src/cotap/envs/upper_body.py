@@ -218,7 +218,7 @@ class UpperBody(Stateful):
             x.reshape(self._shape)
             for x in (self._upper(state.joint_pos), self._upper(state.joint_vel), target, velocity)
         )
-        to_heading = state.heading_w.transpose(1, 2) @ state.torso_rotation_w
+        to_heading = state.torso_to_heading
         base = self._torso.hand_compliance(state, to_heading)
         arms = ArmState(
             q, dq, wanted, state.arms, to_heading, base, target_velocity=rate, fresh=self.fresh, dt=self._dt

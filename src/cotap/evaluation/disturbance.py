@@ -15,7 +15,7 @@ from cotap.compliance.laws import WITHOUT_STIFFNESS
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.scripted_forces import ForceProfile
 from cotap.evaluation.metrics import masked_mean, summaries
-from cotap.evaluation.report import save_figure
+from cotap.evaluation.report import pyplot, save_figure
 from cotap.evaluation.rollout import Trajectory
 from cotap.evaluation.scenario import Scenario
 from cotap.evaluation.transient import back_within, transient_measures
@@ -155,10 +155,7 @@ class Impact(Scenario):
 
     def plot(self, path: Path, result: dict[str, Any]) -> None:
         """Hand error, torso velocity error and arm torque over time, means over the envs that stood."""
-        import matplotlib
-
-        matplotlib.use("Agg")
-        import matplotlib.pyplot as plt
+        plt = pyplot()
 
         curves = result["curve"]
         panels = (("hand_error", "hand error [m]"), ("torso_velocity_error", "torso velocity error [m/s]"),

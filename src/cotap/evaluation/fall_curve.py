@@ -13,7 +13,7 @@ from cotap.checks import require_range
 from cotap.envs import HumanoidEnv
 from cotap.evaluation.disturbance import Impact
 from cotap.evaluation.metrics import summarize
-from cotap.evaluation.report import save_figure
+from cotap.evaluation.report import pyplot, save_figure
 from cotap.evaluation.rollout import Trajectory
 
 
@@ -84,10 +84,7 @@ class FallCurve(Impact):
 
     def plot(self, path: Path, result: dict[str, Any]) -> None:
         """Fall rate with its interval against impulse."""
-        import matplotlib
-
-        matplotlib.use("Agg")
-        import matplotlib.pyplot as plt
+        plt = pyplot()
 
         figure, axis = plt.subplots(figsize=(5.2, 3.8), constrained_layout=True)
         draw_fall_curve(axis, result, "#2171b5", result["method"])

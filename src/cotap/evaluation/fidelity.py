@@ -16,7 +16,7 @@ from cotap.compliance.laws import WITHOUT_STIFFNESS
 from cotap.envs import HumanoidEnv
 from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.metrics import summarize
-from cotap.evaluation.report import heading, save_figure
+from cotap.evaluation.report import heading, pyplot, save_figure
 from cotap.evaluation.rollout import PolicyFunction, acting
 from cotap.evaluation.static import HeldLoad, settle
 from cotap.motions.reference import ClipConfig, load_clips
@@ -240,10 +240,7 @@ def table(content: dict[str, Any]) -> str:
 
 def plot(path: Path, content: dict[str, Any]) -> None:
     """Error against commanded stiffness, axis by axis; a cross on the upper edge for one without bound."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    plt = pyplot()
 
     figure, axis = plt.subplots(figsize=(5.2, 3.8), constrained_layout=True)
     for name, color in zip("xyz", ("#cb181d", "#238b45", "#2171b5"), strict=True):

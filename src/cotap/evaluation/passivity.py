@@ -20,10 +20,11 @@ from cotap.evaluation.exciter import COMMANDS, GENES, Exciters, Limits, best_of,
 from cotap.evaluation.law_options import LawOptions, parse_law
 from cotap.evaluation.metrics import summarize
 from cotap.evaluation.protocol import HELD, mirrored_pose, select_motion
-from cotap.evaluation.report import heading, save_figure
+from cotap.evaluation.report import heading, pyplot, save_figure
 from cotap.evaluation.rollout import UPPER_ACTIONS, PolicyFunction, acting, picture_row
 from cotap.evaluation.scenario import Stance
 from cotap.evaluation.stability import NOTHING_J, random_poses
+from cotap.rotations import rotate
 
 _EXPLORED = 0.5
 """Standard deviation of what the search adds at first; it ends at a fifth of it."""
@@ -224,9 +225,8 @@ def _hand(env: HumanoidEnv) -> tuple[torch.Tensor, torch.Tensor]:
     arms, s = env.upper_body.arms, env.state
     reference = env.motions.current().position.unflatten(1, (len(env.spec.arms), -1))
     offset_t = (s.arms.tip - arms.chains.pose(reference).tip)[:, 0]
-    velocity_t = _rotated(arms.chains.jacobian(s.arms)[:, 0], env.reader.arm_joints(s.joint_vel)[:, 0])
-    to_heading = s.heading_w.transpose(1, 2) @ s.torso_rotation_w
-    return _rotated(to_heading, offset_t), _rotated(to_heading, velocity_t)
+    velocity_t = rotate(arms.chains.jacobian(s.arms)[:, 0], env.reader.arm_joints(s.joint_vel)[:, 0])
+    return rotate(s.torso_to_heading, offset_t), rotate(s.torso_to_heading, velocity_t)
 
 
 def _work(env: HumanoidEnv, before: RobotState) -> torch.Tensor:
@@ -234,12 +234,8 @@ def _work(env: HumanoidEnv, before: RobotState) -> torch.Tensor:
     after = env.record.state
     moved_w = after.hand_pos_w[:, 0] - before.hand_pos_w[:, 0]
     if not env.cfg.fixed_base:
-        moved_w = _rotated(before.torso_rotation_w, after.arms.tip[:, 0] - before.arms.tip[:, 0])
+        moved_w = rotate(before.torso_rotation_w, after.arms.tip[:, 0] - before.arms.tip[:, 0])
     return (env.hand_force_w[:, 0] * moved_w).sum(1)
-
-
-def _rotated(matrix: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
-    return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
 
 
 def _row(tally: Tally, largest: torch.Tensor, mine: torch.Tensor, seed: int) -> dict[str, Any]:
@@ -277,10 +273,7 @@ def _cell(row: dict[str, Any]) -> str:
 
 def plot(path: Path, content: dict[str, Any]) -> None:
     """Bars with intervals, a group per command."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    plt = pyplot()
 
     figure, axis = plt.subplots(figsize=(8.5, 3.8), constrained_layout=True)
     rows, width = content["rows"], 0.8 / len(content["rows"])

@@ -15,7 +15,7 @@ from cotap.envs.scripted_forces import ForceProfile
 from cotap.evaluation.disturbance import falls_by_time, window_measures
 from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.metrics import summaries
-from cotap.evaluation.report import save_figure
+from cotap.evaluation.report import pyplot, save_figure
 from cotap.evaluation.rollout import Trajectory
 from cotap.evaluation.scenario import Scenario
 from cotap.robots import RobotSpec
@@ -79,10 +79,7 @@ class PeriodicLoad(Scenario):
 
     def plot(self, path: Path, result: dict[str, Any]) -> None:
         """Elbow torques with the static prediction, and the hands' height, over time."""
-        import matplotlib
-
-        matplotlib.use("Agg")
-        import matplotlib.pyplot as plt
+        plt = pyplot()
 
         curves, law = result["curve"], result["settings"]["env"]["upper_body"]
         figure, (torque, height) = plt.subplots(1, 2, figsize=(10.5, 3.6), constrained_layout=True)

@@ -70,12 +70,20 @@ def sheet_path(video: str) -> Path:
     return path.with_name(f"{path.stem}_frames.png")
 
 
-def save_figure(figure: Any, path: Path) -> None:
-    """Write a matplotlib figure, whole or not at all, and close it."""
+def pyplot() -> Any:
+    """matplotlib's `pyplot`, for figures that are written and not shown."""
+    import matplotlib
+
+    matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
+    return plt
+
+
+def save_figure(figure: Any, path: Path) -> None:
+    """Write a matplotlib figure, whole or not at all, and close it."""
     write_atomically(path, lambda p: figure.savefig(p, dpi=130, format=path.suffix.lstrip(".") or "png"))
-    plt.close(figure)
+    pyplot().close(figure)
 
 
 def table(result: dict[str, Any]) -> str:
@@ -100,10 +108,7 @@ def heading(result: dict[str, Any]) -> str:
 
 def plot_tracking(path: Path, t: Trajectory, gait_period_s: float, settle_s: float) -> None:
     """Commanded against gait-averaged measured velocity, one panel per axis, and heights in stance."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    plt = pyplot()
 
     measured = moving_average(t.velocity, round(gait_period_s / t.dt))
     ok = settled(t, settle_s + gait_period_s)

@@ -169,7 +169,7 @@ def trajectory_row(env: HumanoidEnv, fell: torch.Tensor) -> dict[str, torch.Tens
         "arm_torque": r.torque[:, upper],
         "arm_torque_share": r.torque[:, upper].abs() / env.arm_limits.flatten(),
         "arm_static_torque": arm_static_torque(env.upper_body.arms, s, env.hand_force_w),
-        "hand_offset": offset_t @ (s.heading_w.transpose(1, 2) @ s.torso_rotation_w).transpose(1, 2),
+        "hand_offset": offset_t @ s.torso_to_heading.transpose(1, 2),
         "hand_error": offset_t.norm(dim=2),
         "foot_contact": s.foot_contact,
         "foot_speed": s.foot_velocity_w[:, :, :2].norm(dim=2),

@@ -16,7 +16,7 @@ from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.scripted_forces import ForceProfile
 from cotap.evaluation.linearization import linearize
 from cotap.evaluation.protocol import Protocol
-from cotap.evaluation.report import heading, save_figure
+from cotap.evaluation.report import heading, pyplot, save_figure
 from cotap.evaluation.rollout import PolicyFunction, idle, picture_row
 from cotap.persistence import uniform
 from cotap.robots import RobotSpec
@@ -216,10 +216,7 @@ def table(content: dict[str, Any]) -> str:
 
 def plot(path: Path, content: dict[str, Any]) -> None:
     """Growth and share of unstable poses per wall, and trials that energy is drawn from."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    plt = pyplot()
 
     figure, axes = plt.subplots(1, 3, figsize=(12.0, 3.4), constrained_layout=True)
     rows = content["linearised"]

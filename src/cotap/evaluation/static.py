@@ -16,7 +16,7 @@ from cotap.compliance.laws import WITHOUT_STIFFNESS
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.scripted_forces import ForceProfile
 from cotap.evaluation.protocol import mirrored_pose, require_pose
-from cotap.evaluation.report import heading, save_figure
+from cotap.evaluation.report import heading, pyplot, save_figure
 from cotap.evaluation.rollout import UPPER_ACTIONS, PolicyFunction, acting, picture_row
 from cotap.evaluation.scenario import Stance
 
@@ -183,7 +183,7 @@ def settle(env: HumanoidEnv, policy: PolicyFunction, seconds: float, side: int) 
         averages.append(total)
         if begin == 0:
             s = env.state
-            rotation = s.heading_w.transpose(1, 2) @ s.torso_rotation_w
+            rotation = s.torso_to_heading
             condition = condition_number(env.reader.arm_chains.jacobian(s.arms)[:, side])
     moved = (rotation @ (averages[1] - averages[0]).unsqueeze(-1)).squeeze(-1)
     torque = env.record.torque[:, env.num_lower :].unflatten(1, (len(env.spec.arms), -1))[:, side]
@@ -255,10 +255,7 @@ def table(content: dict[str, Any]) -> str:
 
 def plot(path: Path, content: dict[str, Any]) -> None:
     """Force against displacement along the load, with the line that the commanded stiffness asks for."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    plt = pyplot()
 
     curve, commanded = content["curve"], content["effective_stiffness"]["commanded"]
     load = torch.tensor(content["settings"]["force"])

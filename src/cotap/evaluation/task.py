@@ -17,7 +17,7 @@ from cotap.evaluation.disturbance import per_env_figures
 from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.metrics import masked_mean, summaries
 from cotap.evaluation.protocol import RolloutProtocol
-from cotap.evaluation.report import save_figure
+from cotap.evaluation.report import pyplot, save_figure
 from cotap.evaluation.rollout import Trajectory
 
 PARTS = tuple(TASK_WEIGHTS)
@@ -75,10 +75,7 @@ class Task(RolloutProtocol):
 
     def plot(self, path: Path, result: dict[str, Any]) -> None:
         """The return and its parts, as bars."""
-        import matplotlib
-
-        matplotlib.use("Agg")
-        import matplotlib.pyplot as plt
+        plt = pyplot()
 
         shown = {name: m for name, m in result["metrics"].items() if name.startswith("return")}
         figure, axis = plt.subplots(figsize=(6, 3.4), constrained_layout=True)

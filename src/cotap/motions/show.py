@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from cotap.evaluation.render import contact_sheet, render_frames
+from cotap.evaluation.report import pyplot
 from cotap.files import write_atomically
 from cotap.motions.library import FPS, MotionClip, MotionLibrary
 from cotap.motions.quality import forward_kinematics
@@ -33,10 +34,7 @@ def draw(library: MotionLibrary, spec: RobotSpec, folder: Path) -> Iterator[Path
 
 def plot_clip(path: Path, clip: MotionClip, spec: RobotSpec) -> None:
     """Joint angles over time, arm by arm, and the hands' paths seen from the side and from the front."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    plt = pyplot()
 
     hands = forward_kinematics(spec, clip.arms)[2]
     times = np.arange(len(clip.arms)) / FPS

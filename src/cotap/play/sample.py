@@ -26,7 +26,7 @@ def take_sample(env: HumanoidEnv, fell: torch.Tensor, laws: list[list[str]], for
     """
     state, reference = env.record.state, env.record.reference.position
     points_w, reference_w = _hands_w(env, reference)
-    jacobian_h = _to_heading(env).unsqueeze(1) @ env.reader.arm_chains.jacobian(state.arms)
+    jacobian_h = state.torso_to_heading.unsqueeze(1) @ env.reader.arm_chains.jacobian(state.arms)
     stiffness = env.arm_stiffness()
     none = [[law in WITHOUT_STIFFNESS for law in row] for row in laws]
     commanded = env.upper_body.parameters.stiffness.masked_fill(torch.tensor(none).unsqueeze(-1), math.nan)
@@ -58,11 +58,6 @@ def effective_stiffness(jacobian: torch.Tensor, joint_stiffness: torch.Tensor) -
     # A straight arm does not give along itself at all; a micrometre per newton stands for that.
     rigid = 1e-6 * torch.eye(3, dtype=torch.float64)
     return torch.linalg.inv(compliance + rigid).float()
-
-
-def _to_heading(env: HumanoidEnv) -> torch.Tensor:
-    s = env.record.state
-    return s.heading_w.transpose(1, 2) @ s.torso_rotation_w
 
 
 def _hands_w(env: HumanoidEnv, reference: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

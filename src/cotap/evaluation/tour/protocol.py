@@ -20,10 +20,11 @@ from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.protocol import Protocol
 from cotap.evaluation.rollout import UPPER_ACTIONS, PolicyFunction, acting, picture_row
 from cotap.evaluation.tour.arm_walk import INTERVAL_S, ArmWalk, arms_at
-from cotap.evaluation.tour.route import Pilot, draw_waypoints, yaw_of
+from cotap.evaluation.tour.route import Pilot, draw_waypoints
 from cotap.evaluation.tour.scores import TourScorer
 from cotap.evaluation.tour.stance import TourStance, tour_stance
 from cotap.robots import RobotSpec
+from cotap.rotations import yaw_of
 
 ENGINES = ("mujoco", "pybullet")
 SEED_OFFSET = 2**62 + 1
@@ -174,10 +175,7 @@ class Tour(Protocol):
 
     def plot(self, path: Path, result: dict[str, Any]) -> None:
         """Share of runs that are upright over time, and the errors at the ends of the segments."""
-        import matplotlib
-
-        matplotlib.use("Agg")
-        import matplotlib.pyplot as plt
+        plt = report.pyplot()
 
         figure, (left, right) = plt.subplots(1, 2, figsize=(10.0, 3.6), constrained_layout=True)
         left.plot(result["curve"]["time"], result["curve"]["upright"], color="#2171b5")

@@ -28,11 +28,6 @@ def draw_waypoints(count: int, rng: np.random.Generator) -> np.ndarray:
     return np.stack((CENTER_M[0] + radius * np.cos(bearing), CENTER_M[1] + radius * np.sin(bearing), yaw), 1)
 
 
-def yaw_of(rotation_w: torch.Tensor) -> torch.Tensor:
-    """Yaw (N,) [rad] of orientations (N, 3, 3)."""
-    return torch.atan2(rotation_w[:, 1, 0], rotation_w[:, 0, 0])
-
-
 class Pilot:
     """Commands for N robots, each on its way along waypoints, from where their pelvises are.
 
