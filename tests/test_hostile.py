@@ -9,7 +9,6 @@ import os
 import re
 import sys
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -152,7 +151,7 @@ def test_a_checkpoint_with_changed_parts_is_whole_or_refused(trained: Trained, d
     content, runner, folder = trained.content, trained.runner, trained.folder
     path = folder / "parts.pt"
     save_checkpoint(path, damage(content, draw, plain | tensors))
-    uses = (runner.load, load_policy, partial(train._config_of, kind=BaseTraining))
+    uses = (runner.load, load_policy, train._base_config)
     for use in uses:
         try:
             use(str(path))

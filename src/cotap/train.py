@@ -214,7 +214,7 @@ def _resumed_config(checkpoint: str, recipe: str, stage: str, kind: type[Any]) -
 def _base_config(checkpoint: str) -> BaseTraining:
     """The config of a base policy, for as many samples as it was trained on, but for rewards that are not known here.
     Raises CheckpointError for another one."""
-    from cotap.agents.checkpoint import MALFORMED, CheckpointError, load_checkpoint, require_parts
+    from cotap.agents.checkpoint import CheckpointError, load_checkpoint, require_parts
     from cotap.agents.run_log import say
     from cotap.configs.saved import without_unknown_terms
 
@@ -222,11 +222,10 @@ def _base_config(checkpoint: str) -> BaseTraining:
     require_parts(checkpoint, content, ("kind", "layout", "model", "samples", "config"))
     if content["kind"] != "base":
         raise CheckpointError(f"checkpoint {checkpoint!r} is of stage {quoted(content['kind'])}, not 'base'")
-    try:
-        plain = content["config"]["training"]
+    plain = content["config"].get("training")
+    unknown: list[str] = []
+    if isinstance(plain, dict) and "env" in plain:
         plain["env"], unknown = without_unknown_terms(plain["env"])
-    except MALFORMED as error:
-        raise CheckpointError(f"checkpoint {checkpoint!r} has no usable config: {reason_of(error)}") from error
     if unknown:
         say(f"{checkpoint}: trained with rewards that are not known here and are left out: {', '.join(unknown)}")
     training = _config_of(checkpoint, content, BaseTraining)
