@@ -43,7 +43,7 @@ class DeployOptions:
     episode_seconds: float | None = None
     """Length of a trial [s]. By default 20; a scenario has its own."""
     motion: str = HELD
-    """Clip for the arms, `mixture` or `none`. mixture: clips and generated motion, as in the training. none:
+    """Clip for the arms, `mixture` or `none`. mixture: clips and generated motion, as recipes have them. none:
     hold the default pose. A scenario has its own."""
     library: str = ""
     """Motion library (.npz) of the clip. By default the shipped one."""

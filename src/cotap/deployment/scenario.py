@@ -71,7 +71,7 @@ class ArmMotion:
     pose: tuple[float, ...] = ()
     """Arm joints, left arm first [rad]."""
     clip: str = ""
-    """Name of a clip in the motion library; `mixture` mixes clips and generated motion as in training."""
+    """Name of a clip in the motion library; `mixture` mixes clips and generated motion as recipes do."""
     library: str = ""
     """Motion library (.npz) that the clip is taken from; empty for the one that comes with the package."""
 
