@@ -410,9 +410,33 @@ def captured(monkeypatch: pytest.MonkeyPatch, *args: Any) -> train.BaseOptions:
 def test_recipe_sets_the_defaults(monkeypatch: pytest.MonkeyPatch, recipe: str):
     options = captured(monkeypatch, "base", RECIPE, recipe, f"{ENVS}=16", SEED, 7)
     expected = BASE_RECIPES[recipe]()
+    samples = expected.samples
     expected.env.num_envs, expected.seed = 16, 7
+    expected.train_for(samples)
     assert options.training == expected
     assert options.recipe == recipe
+
+
+@pytest.mark.parametrize(
+    ("given", "iterations"),
+    [([], 12_207), ([ENVS, 4096], 3051), ([STEPS, 48], 6103), ([ENVS, 4096, ITERATIONS, 7], 7), ([ITERATIONS, 7], 7)],
+)
+def test_as_many_samples_are_taken_unless_iterations_are_given(
+    monkeypatch: pytest.MonkeyPatch, given: list[Any], iterations: int
+):
+    assert captured(monkeypatch, "base", *given).training.runner.iterations == iterations
+
+
+def test_a_run_that_goes_on_keeps_its_iterations(checkpoint: Path, monkeypatch: pytest.MonkeyPatch):
+    options = captured(monkeypatch, "base", RESUME, checkpoint, ENVS, 2)
+    assert (
+        options.training.runner.iterations == load_checkpoint(checkpoint)["config"]["training"]["runner"]["iterations"]
+    )
+
+
+def test_ablations_keep_their_samples(checkpoint: Path):
+    args = ["--recipe", "goals", BASE_CHECKPOINT, str(checkpoint), ENVS, "4096"]
+    assert train._parse_distill(args).training.samples == pytest.approx(40e6, rel=3e-3)
 
 
 def distill(run_dir: Path, base_checkpoint: Path, *options: Any) -> dict[str, Any]:
@@ -649,6 +673,8 @@ def test_the_quick_pipeline_is_a_small_version_of_both(tmp_path: Path, monkeypat
     assert PipelineOptions(quick=True).iterations() == (1220, 610)
     assert PipelineOptions().iterations() == (12_207, 6103)
     assert PipelineOptions(num_envs=2048).iterations() == (6103, 3051)  # as many samples
+    assert PipelineOptions(recipe="paper").iterations() == (20_000, 20_000)
+    assert PipelineOptions(recipe="paper", num_envs=1024).iterations() == (80_000, 80_000)
     tiny_networks(monkeypatch)
     assert run("--quick", *BOTH, RUN_DIR, tmp_path) == 0
     for stage in ("base", "distill"):
@@ -667,7 +693,7 @@ def test_a_recipe_is_that_of_both_stages(tmp_path: Path, monkeypatch: pytest.Mon
 @pytest.mark.parametrize(
     ("options", "needle"),
     [
-        ([ENVS, 0], "num_envs"),
+        ([ENVS, -1], "num_envs"),
         (["--base-iterations", -1], "base_iterations"),
         ([THREADS, -1], "threads"),
         (["--recipe", "goals"], "default, facet, paper, quick"),

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cotap.agents.checkpoint import STAGES
-from cotap.checks import require_one_of, require_positive_int, require_range
+from cotap.checks import require_one_of, require_range
 from cotap.configs import BASE_RECIPES, DISTILL_RECIPES, BaseTraining, DistillTraining
 from cotap.sim import resolve_backend
 
@@ -31,8 +31,8 @@ class PipelineOptions:
     """Recipe of both stages: default, quick, paper or facet. Without it, default, or quick with --quick."""
     resume: bool = False
     """Go on with the runs in --run-dir. A stage that is finished is not run again."""
-    num_envs: int = 1024
-    """Number of envs."""
+    num_envs: int = 0
+    """Number of envs; 0 for the recipe's. Samples stay the same."""
     base_iterations: int = 0
     """Iterations of stage 1; 0 for as many as the recipe's samples take."""
     distill_iterations: int = 0
@@ -49,7 +49,7 @@ class PipelineOptions:
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
-        require_positive_int("num_envs", self.num_envs)
+        require_range("num_envs", self.num_envs, 0, 1e9)
         for name in ("base_iterations", "distill_iterations"):
             require_range(name, getattr(self, name), 0, 1e9)
         require_range("threads", self.threads, 0, 4096)
@@ -74,10 +74,10 @@ class PipelineOptions:
     def _trainings(self) -> tuple[BaseTraining, DistillTraining]:
         """Both configurations."""
         base = BASE_RECIPES[self.chosen]()
-        samples = base.runner.iterations * base.ppo.steps * base.env.num_envs
-        base.env.robot, base.env.num_envs, base.env.backend = self.robot, self.num_envs, self.backend
-        base.env.num_threads = self.threads
-        base.train_for(samples)  # whatever the number of envs
+        samples = base.samples
+        base.env.robot, base.env.backend, base.env.num_threads = self.robot, self.backend, self.threads
+        base.env.num_envs = self.num_envs or base.env.num_envs
+        base.train_for(samples)
         distill = DISTILL_RECIPES[self.chosen](base)
         base.runner.iterations = self.base_iterations or base.runner.iterations
         distill.runner.iterations = self.distill_iterations or distill.runner.iterations
@@ -129,8 +129,8 @@ def expected(options: PipelineOptions) -> str:
         timed = TimedTraining(HumanoidEnv(training.env), training.ppo, options.device)
         timed.run()  # warm up
         rate = timed.run()
-        samples = training.runner.iterations * training.ppo.steps * options.num_envs
-        lines.append(f"| {stage} | {samples:,} | {rate:,.0f} | {samples / rate / 3600.0:.1f} |")
+        hours = training.samples / rate / 3600.0
+        lines.append(f"| {stage} | {training.samples:,} | {rate:,.0f} | {hours:.1f} |")
     return "\n".join(lines)
 
 
@@ -142,8 +142,9 @@ def _part(options: PipelineOptions, run_dir: Path, iterations: int, begin: list[
     from cotap.agents.checkpoint import load_checkpoint
 
     newest = _newest(run_dir) if options.resume else None
+    envs = ["--num-envs", str(options.num_envs)] if options.num_envs else []
     run_stage(run_dir.name, [
-        "--num-envs", str(options.num_envs), "--seed", str(options.seed), "--threads", str(options.threads),
+        *envs, "--seed", str(options.seed), "--threads", str(options.threads),
         "--backend", options.backend, "--device", options.device, "--iterations", str(iterations),
         "--run-dir", str(run_dir), *(["--resume", str(newest)] if newest else begin),
     ])  # fmt: skip

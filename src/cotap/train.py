@@ -80,10 +80,10 @@ class DistillOptions:
     """Base policy to start from: a file, or a shipped policy's name. It guides the new policy as well. By default the
     shipped base policy."""
     recipe: str = "default"
-    """default, quick, paper, facet, modulated, no-ratio, torque-critic or goals. default: 80 to 1200 N/m. quick: a
-    short default. paper: 150 to 450 N/m. facet: arms under PD, FACET's tracking reward. modulated: the policy sets
-    alpha and stiffness. The others are ablations. Where networks see or do something else than the base's, those are
-    refitted."""
+    """default, quick, paper, short, facet, modulated, no-ratio, torque-critic or goals. default: 80 to 1200 N/m. quick
+    and short: the same, 15 M and 40 M samples. paper: 150 to 450 N/m. facet: arms under PD, FACET's tracking reward.
+    modulated: the policy sets alpha and stiffness. The others are ablations. Where networks see or do something else
+    than the base's, those are refitted."""
     command: tyro.conf.Suppress[str] = ""
     training: Annotated[DistillTraining, tyro.conf.arg(name="")] = field(default_factory=DistillTraining)
 
@@ -163,8 +163,11 @@ def _parse_base(args: list[str]) -> BaseOptions:
     else:
         training = BASE_RECIPES[recipe or "default"]()
     _unpin_library(args, training)
+    samples = training.samples
     default = BaseOptions(recipe=recipe or "default", training=training)
-    return tyro.cli(BaseOptions, args=args, default=default, prog="cotap train base")
+    options = tyro.cli(BaseOptions, args=args, default=default, prog="cotap train base")
+    _train_as_long(args, options, samples)
+    return options
 
 
 def _parse_distill(args: list[str]) -> DistillOptions:
@@ -184,8 +187,17 @@ def _parse_distill(args: list[str]) -> DistillOptions:
         base = base or str(shipped_checkpoint("h1-base"))
         training = DISTILL_RECIPES[recipe](_base_config(base))
     _unpin_library(args, training)
+    samples = training.samples
     default = DistillOptions(recipe=recipe, base_checkpoint=base, training=training)
-    return tyro.cli(DistillOptions, args=args, default=default, prog="cotap train distill")
+    options = tyro.cli(DistillOptions, args=args, default=default, prog="cotap train distill")
+    _train_as_long(args, options, samples)
+    return options
+
+
+def _train_as_long(args: list[str], options: BaseOptions | DistillOptions, samples: int) -> None:
+    """Unless iterations are given, or those of a run that goes on, as many as take so many `samples`."""
+    if not options.resume and not _peek(args, "--runner.iterations"):
+        options.training.train_for(samples)
 
 
 def _unpin_library(args: list[str], training: BaseTraining | DistillTraining) -> None:

@@ -219,7 +219,12 @@ def test_facets_reward_is_that_of_both_stages():
 @pytest.mark.parametrize("num_envs", [512, 1024])
 @pytest.mark.parametrize(
     ("names", "samples"),
-    [(["default"], 150e6), (["quick"], 15e6), (["no-ratio", "torque-critic", "goals", "facet"], 40e6)],
+    [
+        (["default"], 150e6),
+        (["quick"], 15e6),
+        (["short", "no-ratio", "torque-critic", "goals", "facet"], 40e6),
+        (["paper"], 20_000 * 24 * 4096),
+    ],
 )
 def test_recipes_ask_for_as_many_samples_whatever_the_number_of_envs(names: list[str], samples: float, num_envs: int):
     base = BASE_RECIPES["default"]()

@@ -39,9 +39,15 @@ class BaseTraining:
     ppo: DualPPOConfig = field(default_factory=DualPPOConfig)
     runner: RunnerConfig = field(default_factory=RunnerConfig)
 
+    @property
+    def samples(self) -> int:
+        """What the run takes in all, with one process."""
+        return self.runner.iterations * self.ppo.steps * self.env.num_envs
+
     def train_for(self, samples: float) -> None:
         """Set the iterations that take so many samples, with the envs and steps that are set now."""
-        self.runner.iterations = max(1, int(samples / (self.ppo.steps * self.env.num_envs)))
+        a_time = max(1, self.ppo.steps * self.env.num_envs)  # both are checked later
+        self.runner.iterations = max(1, int(samples / a_time))
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""

@@ -53,14 +53,15 @@ def quick(base: BaseTraining) -> DistillTraining:
 
 
 def paper(base: BaseTraining) -> DistillTraining:
-    """The paper's range of stiffness (its Table II), drawn uniformly, PD's damping, and its 20,000 iterations."""
+    """The paper's range of stiffness (its Table II), drawn uniformly, PD's damping, no pushes, and as many samples as
+    its 20,000 iterations of 4096 envs have. All else is the base's: begin with one of recipe `paper`."""
     training = default(base)
     pd_damped = LawConfig(name="cotap", damping="pd")
     sampling = LawSampling(enabled=True, stiffness=(150.0, 450.0), log_uniform=False)
     training.env.upper_body = UpperBodyConfig(left=pd_damped, right=copy.deepcopy(pd_damped), sampling=sampling)
     training.env.forces.pushes.enabled = False
     training.distillation.anew = ()
-    training.runner.iterations = 20_000
+    training.train_for(20_000 * training.ppo.steps * 4096)
     return training
 
 
@@ -69,12 +70,12 @@ def _after_base(training: DistillTraining, base: BaseTraining) -> None:
     env = training.env
     env.assist, env.curriculum = AssistConfig(), CurriculumConfig()
     env.forces.pushes.ramp, env.forces.hand_loads.ramp = RampConfig(), RampConfig()
-    halvings = base.runner.iterations * base.ppo.steps * base.env.num_envs / base.ppo.std_half_life
+    halvings = base.samples / base.ppo.std_half_life
     training.ppo.initial_std = max(base.ppo.least_std, base.ppo.initial_std * 0.5**halvings)
 
 
-def ablation(base: BaseTraining) -> DistillTraining:
-    """What ablations change one part of: `default`, 40 M samples."""
+def short(base: BaseTraining) -> DistillTraining:
+    """What ablations change one part of and are compared with: `default`, 40 M samples."""
     training = default(base)
     training.train_for(40e6)
     return training
@@ -82,21 +83,22 @@ def ablation(base: BaseTraining) -> DistillTraining:
 
 def without_ratio(base: BaseTraining) -> DistillTraining:
     """Ablation: compliance does not give way to PD near singular arms (paper, Table IV)."""
-    training = ablation(base)
+    training = short(base)
     training.env.upper_body.singularity_ratio = False
     return training
 
 
 def with_torque_for_critics(base: BaseTraining) -> DistillTraining:
-    """Ablation: the arms' torque is seen by the critics only (paper, appendix C)."""
-    training = ablation(base)
+    """Ablation: the arms' torque is seen by the critics only (paper, appendix C). So it is for the base that guides:
+    its networks, refitted, take the torque for what it is on average."""
+    training = short(base)
     training.env.observations.arm_torque = "critic"
     return training
 
 
 def with_goals(base: BaseTraining) -> DistillTraining:
     """Ablation: actors see stiffness and alpha as commanded."""
-    training = ablation(base)
+    training = short(base)
     training.env.observations.goals = True
     return training
 
@@ -104,7 +106,7 @@ def with_goals(base: BaseTraining) -> DistillTraining:
 def facet(base: BaseTraining) -> DistillTraining:
     """FACET as the paper trains it (appendix D): its tracking reward on the data's own motion, arms under PD. Forces
     move the reference in evaluation alone, by the law `facet`."""
-    training = ablation(base)
+    training = short(base)
     training.env.upper_body = UpperBodyConfig()
     training.distillation.anew = ()
     track_as_facet(training.env.rewards.upper)
@@ -130,6 +132,7 @@ def modulated(base: BaseTraining) -> DistillTraining:
 DISTILL_RECIPES: dict[str, Callable[[BaseTraining], DistillTraining]] = {
     "default": default,
     "quick": quick,
+    "short": short,
     "paper": paper,
     "no-ratio": without_ratio,
     "torque-critic": with_torque_for_critics,
