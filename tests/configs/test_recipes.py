@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from operator import attrgetter
 from typing import Any
 
@@ -11,6 +12,7 @@ import torch
 
 from cotap.configs import BASE_RECIPES, DISTILL_RECIPES, BaseTraining, DistillTraining, from_plain, to_plain
 from cotap.envs import HumanoidEnv
+from cotap.robots import ROBOTS
 
 ENV = {
     # Table II, domain randomisation. The mass of the base is that of the torso link.
@@ -43,6 +45,25 @@ BASE = {
     "env.upper_body.left.name": "pd",
     "env.upper_body.right.name": "pd",
     "env.rewards.upper.reference_closeness": 0.0,
+    # FALCON's commands, gait, and PPO.
+    "env.commands.velocity_x": (-1.0, 1.0),
+    "env.commands.velocity_y": (-1.0, 1.0),
+    "env.commands.yaw_rate": (-1.0, 1.0),
+    "env.commands.height_offset": (-0.25, 0.0),
+    "env.commands.stand_probability": 0.4,
+    "env.commands.resample_s": (10.0, 10.0),
+    "env.gait.period_s": 1.0,
+    "env.forces.hand_loads.force_x": (-40.0, 40.0),
+    "env.forces.hand_loads.force_y": (-40.0, 40.0),
+    "env.forces.hand_loads.force_z": (-50.0, 5.0),
+    "ppo.initial_std": 0.8,
+    "ppo.entropy": 0.01,
+    "ppo.epochs": 5,
+    "ppo.mini_batches": 4,
+    "ppo.steps": 24,
+    "ppo.learning_rate": 1e-4,
+    "ppo.lam": 0.95,
+    "ppo.clip": 0.2,
     "ppo.hidden": (512, 256, 128),
     "ppo.symmetric": False,
     # FALCON's: one discount.
@@ -203,6 +224,18 @@ def test_a_distillation_begins_with_what_its_base_ended_with():
     assert env.forces.pushes.ramp.share(0.0) == env.forces.hand_loads.ramp.share(0.0) == 1.0
     assert env.curriculum.arm_motion_samples == 0.0
     assert training.ppo.initial_std == training.ppo.least_std
+
+
+def test_a_distillation_has_what_the_punch_tour_has():
+    """Pushes on any link, in any direction, of more than 40 N s on G1; a place that is held."""
+    base = BASE_RECIPES["default"]()
+    base.env.robot = "g1"
+    env = DISTILL_RECIPES["default"](base).env
+    pushes = env.forces.pushes
+    assert pushes.velocity[1] * ROBOTS["g1"]().mass_kg > 45.0
+    assert pushes.largest_pitch == pytest.approx(math.pi / 2)
+    assert pushes.link_share > 0.0
+    assert env.path.share > 0.0
 
 
 def test_exploration_goes_on_from_where_a_base_that_stopped_early_left_it():

@@ -76,6 +76,14 @@ def test_one_push_follows_another_after_its_interval(rng):
     assert float(on.float().mean()) == pytest.approx(0.2 * 50 / 60, abs=0.03)
 
 
+def test_pushes_may_come_from_everywhere(rng):
+    steep = 0.5 * math.pi
+    unit = torch.nn.functional.normalize(one_push(pushes(8000, velocity=(0.5, 1.0), largest_pitch=steep), rng), dim=1)
+    pitch = unit[:, 2].clamp(-1.0, 1.0).asin()
+    spread = torch.histc(pitch, 4, -steep, steep) / 8000
+    assert spread.tolist() == pytest.approx([0.25] * 4, abs=0.02)
+
+
 @pytest.mark.parametrize(("hand", "link"), [(0.3, 0.2), (1.0, 0.0), (0.0, 1.0), (0.0, 0.0), (0.4, 0.6)])
 def test_places_have_their_shares(rng, hand, link):
     p = pushes(20_000, hand_share=hand, link_share=link)
@@ -192,7 +200,8 @@ def test_they_go_on_exactly(rng):
 @pytest.mark.parametrize(
     ("field", "value"),
     [("velocity", (1.0, 0.0)), ("velocity", (-1.0, 0.0)), ("duration_s", (0.0, 0.1)), ("interval_s", (0.01, 1.0)),
-     ("episode_share", 1.1), ("hand_share", -0.1), ("link_share", 0.8), ("ramp", RampConfig(1.0, 0.0))],
+     ("episode_share", 1.1), ("hand_share", -0.1), ("link_share", 0.8), ("largest_pitch", 1.6),
+     ("ramp", RampConfig(1.0, 0.0))],
 )  # fmt: skip
 def test_bad_fields_are_named(field, value):
     with pytest.raises(ValueError, match=rf"pushes\.{field}"):

@@ -97,8 +97,8 @@ def paper() -> BaseTraining:
             actions=ActionConfig(lower_scale=0.25, upper_scale=0.25, upper_mode="absolute"),
             observations=ObservationConfig(critic="history"),
             commands=CommandConfig(
-                velocity_x=(-1.0, 1.0), velocity_y=(-1.0, 1.0), yaw_rate=(-1.0, 1.0), stand_probability=0.4,
-                axis_zero_probability=0.0, resample_s=(10.0, 10.0),
+                velocity_x=(-1.0, 1.0), velocity_y=(-1.0, 1.0), yaw_rate=(-1.0, 1.0), height_offset=(-0.25, 0.0),
+                stand_probability=0.4, axis_zero_probability=0.0, resample_s=(10.0, 10.0),
             ),
             gait=GaitConfig(period_s=1.0),
             assist=AssistConfig(enabled=True),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -37,7 +38,10 @@ def default(base: BaseTraining) -> DistillTraining:
         left=LawConfig(name="cotap"), right=LawConfig(name="cotap"), sampling=LawSampling(enabled=True, full_alpha=0.25)
     )
     _after_base(training, base)
-    env.forces.pushes.hand_share = 0.5  # hands are what the law is for
+    pushes = env.forces.pushes
+    pushes.hand_share = 0.5  # hands are what the law is for
+    pushes.velocity, pushes.largest_pitch = (0.0, 1.5), 0.5 * math.pi
+    env.path.share = 0.1
     env.rewards.upper.reference_closeness = 1.0
     if env.actions.upper_mode == "residual":
         training.distillation.anew = ("upper",)  # under PD it has learned to resist loads

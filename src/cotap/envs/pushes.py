@@ -12,7 +12,6 @@ from cotap.envs.curriculum import RampConfig
 from cotap.persistence import Stateful, uniform
 from cotap.rotations import rotate_inverse
 
-_LARGEST_PITCH_RAD = 0.5
 _NEVER_S = 1e9
 
 
@@ -30,6 +29,8 @@ class PushConfig:
     """Share of the pushes that hit a hand."""
     link_share: float = 0.3
     """Share of the pushes that hit the centre of mass of a link drawn from all; the rest hit the base."""
+    largest_pitch: float = 0.5
+    """Largest angle between a push and the ground, uniform up to that, upward or downward [rad]."""
     duration_s: tuple[float, float] = (0.04, 0.12)
     """How long a push lasts, uniform [s]."""
     interval_s: tuple[float, float] = (2.0, 6.0)
@@ -47,11 +48,12 @@ class PushConfig:
         require_range("pushes.episode_share", self.episode_share, 0.0, 1.0)
         require_range("pushes.hand_share", self.hand_share, 0.0, 1.0)
         require_range("pushes.link_share", self.link_share, 0.0, 1.0 - self.hand_share)
+        require_range("pushes.largest_pitch", self.largest_pitch, 0.0, 0.5 * math.pi)
         self.ramp.check("pushes.ramp")
 
 
 class Pushes(Stateful):
-    """One push at a time in each of N envs; direction uniform about the vertical, pitch up to 0.5 rad.
+    """One push at a time in each of N envs; direction uniform about the vertical.
 
     Where a push acts is a number: 0 for the base, then the hands, then the links.
 
@@ -109,7 +111,7 @@ class Pushes(Stateful):
     def _draw(self, mask: torch.Tensor, rng: torch.Generator) -> None:
         """Draw the coming pushes of the envs of `mask`, one ahead, so that critics can see what will come."""
         cfg, n = self.cfg, int(mask.sum())
-        yaw, pitch = uniform(rng, -math.pi, math.pi, n), uniform(rng, -_LARGEST_PITCH_RAD, _LARGEST_PITCH_RAD, n)
+        yaw, pitch = uniform(rng, -math.pi, math.pi, n), uniform(rng, -cfg.largest_pitch, cfg.largest_pitch, n)
         direction = torch.stack((pitch.cos() * yaw.cos(), pitch.cos() * yaw.sin(), pitch.sin()), -1)
         kind = torch.rand(n, generator=rng, device=rng.device)
         hand = torch.randint(1, 1 + self._num_hands, (n,), generator=rng, device=rng.device)
