@@ -3,6 +3,7 @@
 python -m release.publish runs/base/checkpoint_006104.pt h1-base
 
 Writes NAME.pt, NAME.json and one NAME.EVALUATION.json for each of `EVALUATIONS`. No number of the policy changes.
+Afterwards, `python -m release.card` sums up all that ships.
 """
 
 from __future__ import annotations
