@@ -88,8 +88,14 @@ def description(target: Path, content: dict[str, Any], headlines: dict[str, Any]
     }
 
 
-def publish(source: Path, name: str, envs: int) -> int:
+def publish(source: Path, name: str, envs: int, threads: int = 0) -> int:
     """Write everything, once all is there. Returns the exit status: 0, or that of the evaluation that failed.
+
+    Args:
+        source: The run's checkpoint.
+        name: What it is published as.
+        envs: Of the large evaluations.
+        threads: Of theirs; 0 takes every CPU.
 
     Raises:
         ValueError: the checkpoint is of another robot or stage than its name.
@@ -104,6 +110,7 @@ def publish(source: Path, name: str, envs: int) -> int:
         for evaluation, options in EVALUATIONS.items():
             out = staged.with_name(f"{name}.{evaluation}.json")
             args = [str(envs) if option == ENVS else option for option in options]
+            args += [] if "--threads" in args else ["--threads", str(threads)]
             if status := evaluate([*args, "--checkpoint", str(staged), "--json", str(out)]):
                 return status
             result = json.loads(out.read_text())
@@ -127,9 +134,11 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("checkpoint", type=find_checkpoint)
     parser.add_argument("name", choices=CHECKPOINTS)
     parser.add_argument("--envs", type=int, default=1024, help="of the large evaluations")
+    parser.add_argument("--threads", type=int, default=0, help="of the large evaluations; 0 takes every CPU")
     options = parser.parse_args(argv)
     try:
-        return publish(options.checkpoint, options.name, require_positive_int("envs", options.envs))
+        envs = require_positive_int("envs", options.envs)
+        return publish(options.checkpoint, options.name, envs, options.threads)
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

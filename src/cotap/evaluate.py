@@ -80,8 +80,7 @@ class Options(Generic[P]):
     plot: str = ""
     """Write a plot here (PNG)."""
     video: str = ""
-    """Write a video of the first env here (MP4). For velocity-tracking, it shows a series of commands, without
-    loads. A contact sheet (NAME_frames.png) goes beside it."""
+    """Write a video of the first env here (MP4). A contact sheet (NAME_frames.png) goes beside it."""
 
 
 @dataclass
