@@ -19,6 +19,7 @@ from cotap.agents.checkpoint import load_checkpoint, require_parts, save_checkpo
 from cotap.checks import require_positive_int
 from cotap.evaluate import main as evaluate
 from cotap.evaluation.policy import CHECKPOINTS, checkpoint_path, find_checkpoint
+from release.recipe import require_default
 
 TRACKING, ENVS = "velocity-tracking", "ENVS"
 HELD_OUT = ("dance_b", "dance_b_mirrored", "kick", "kick_mirrored")
@@ -98,7 +99,7 @@ def publish(source: Path, name: str, envs: int, threads: int = 0) -> int:
         threads: Of theirs; 0 takes every CPU.
 
     Raises:
-        ValueError: the checkpoint is of another robot or stage than its name.
+        ValueError: the checkpoint is of another robot or stage than its name, or not of the recipe `default`.
     """
     target = checkpoint_path(name)
     target.parent.mkdir(exist_ok=True)
@@ -106,6 +107,7 @@ def publish(source: Path, name: str, envs: int, threads: int = 0) -> int:
         staged = Path(folder) / target.name
         content = strip(source, staged)
         require_name(name, content)
+        require_default(content)
         headlines: dict[str, Any] = {}
         for evaluation, options in EVALUATIONS.items():
             out = staged.with_name(f"{name}.{evaluation}.json")

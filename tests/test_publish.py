@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from random_policy import save_random_policy
 
 from cotap.agents.checkpoint import load_checkpoint, save_checkpoint, sha256
+from cotap.configs import BASE_RECIPES, DISTILL_RECIPES, to_plain
 from cotap.evaluation.policy import load_policy
 from release import publish
+from release.recipe import require_default
 
 TINY = ["velocity-tracking", "--episode-seconds", "2", "--command-seconds", "1.5", "--threads", "1"]
 
@@ -22,6 +25,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(publish, "checkpoint_path", lambda name: tmp_path / "checkpoints" / f"{name}.pt")
     evaluations = {"velocity-tracking": [*TINY, "--num-envs", "ENVS"], "small": [*TINY, "--num-envs", "2"]}
     monkeypatch.setattr(publish, "EVALUATIONS", evaluations)
+    monkeypatch.setattr(publish, "require_default", lambda _content: None)  # networks of tests are tiny
     return tmp_path / "checkpoints"
 
 
@@ -77,4 +81,38 @@ def test_a_policy_is_published_under_its_own_name_only(tmp_path: Path, package: 
     source = save_random_policy(tmp_path / "run.pt", "distill")
     assert publish.main([str(source), "h1-base"]) == 2
     assert "is of h1-cotap, it cannot be published as h1-base" in capsys.readouterr().err
+    assert not list(package.iterdir())
+
+
+def of_default(stage: str) -> dict[str, Any]:
+    """A checkpoint's config of a run of the recipe `default`, whose base had 60 M samples."""
+    training = BASE_RECIPES["default"]()
+    training.env.robot, training.threads, training.seed = "g1", 1, 3
+    config: dict[str, Any] = {"stage": stage}
+    if stage == "distill":
+        training.train_for(60e6)
+        config["base"] = {"runs": [{"samples": 1}, {"samples": training.samples}]}
+        training = DISTILL_RECIPES["default"](training)
+    return {"config": config | {"training": json.loads(json.dumps(to_plain(training)))}}
+
+
+@pytest.mark.parametrize("stage", ["base", "distill"])
+def test_what_ships_is_of_the_recipe_default(stage: str):
+    content = of_default(stage)
+    require_default(content)
+    del content["config"]["training"]["env"]["forces"]["punches"]  # of before there were any
+    require_default(content)
+    content["config"]["training"]["ppo"]["gamma"] = 0.5
+    content["config"]["training"]["env"]["rewards"]["lower"] |= {"foot_slip": -9.0, "gone": 1.0}
+    said = r"recipe default: env\.rewards\.lower\.foot_slip is -9\.0, not .*gamma is 0\.5"
+    with pytest.raises(ValueError, match=said) as caught:
+        require_default(content)
+    assert "env.rewards.lower.gone is 1.0, not None" in str(caught.value)
+
+
+def test_a_run_of_another_recipe_does_not_ship(tmp_path: Path, package: Path, monkeypatch: Any, capsys: Any):
+    monkeypatch.setattr(publish, "require_default", require_default)
+    source = save_random_policy(tmp_path / "run.pt")  # of other networks
+    assert publish.main([str(source), "h1-base"]) == 2
+    assert "ppo.hidden is [8, 8], not [256, 128, 64]" in capsys.readouterr().err
     assert not list(package.iterdir())
