@@ -1,10 +1,11 @@
 """How fast: physics, environment and training on this machine, as ratios within one run, beside its peers.
 
-The physics reference is fixed: control steps of four 5 ms `mj_step` of H1 with feet-only contacts in plain mjbatch,
-from the states and with the torques of a recorded rollout (of the shipped base policy, or of zero actions where none is
-shipped), and nothing else. Open-loop torques soon make a robot fall, so each control step starts from its recorded
-state (restarts included); only the stepping is timed. All figures are control steps (20 ms) per second. Parts are
-measured in turn, several times over: rates are medians over the rounds, ratios are medians of the ratios within rounds.
+The physics reference is fixed: control steps of four 5 ms `mj_step` of the robot with feet-only contacts in plain
+mjbatch, from the states and with the torques of a recorded rollout (of the robot's shipped base policy, or of zero
+actions where none is shipped), and nothing else. Open-loop torques soon make a robot fall, so each control step starts
+from its recorded state (restarts included); only the stepping is timed. All figures are control steps (20 ms) per
+second. Parts are measured in turn, several times over: rates are medians over the rounds, ratios are medians of the
+ratios within rounds.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -37,18 +39,21 @@ from mujoco import rollout
 
 from cotap.agents.actors import as_dict
 from cotap.agents.checkpoint import write_json
+from cotap.agents.distillation import Guide
 from cotap.agents.timing import TimedTraining
 from cotap.checks import require_positive_int, require_range
-from cotap.compliance import ArmKinematics
+from cotap.compliance import ArmKinematics, modulate_stiffness
+from cotap.compliance.fast import blended_stiffness
 from cotap.compliance.interface import ArmState, LawParameters
 from cotap.compliance.inverse_kinematics import ArmIK
 from cotap.compliance.laws import LAWS, LawConfig
-from cotap.configs import BASE_RECIPES
+from cotap.configs import BASE_RECIPES, DISTILL_RECIPES
+from cotap.configs.base import BaseTraining
 from cotap.envs import HumanoidEnv
 from cotap.evaluation.policy import find_checkpoint, load_policy, shipped_names
 from cotap.motions import MotionClip, MotionLibrary
 from cotap.motions.reference import ReferenceConfig, ReferenceMotion
-from cotap.robots import RobotSpec, h1
+from cotap.robots import ROBOTS, RobotSpec
 from cotap.robots.chains import arm_model
 from cotap.robots.mjcf import build_model
 from cotap.sim import batch_of
@@ -71,28 +76,37 @@ class Recording:
     torque: np.ndarray
 
 
-def actor(checkpoint: str) -> tuple[str, Actor]:
-    """A policy and its name: of a checkpoint, or else the shipped base, or else zero actions."""
-    name = checkpoint or ("h1-base" if "h1-base" in shipped_names() else "")
+def actor(checkpoint: str, robot: str = "h1") -> tuple[str, Actor]:
+    """A policy and its name: of a checkpoint, or else the robot's shipped base, or else zero actions."""
+    name = checkpoint or (f"{robot}-base" if f"{robot}-base" in shipped_names() else "")
     if name:
         return name, load_policy(find_checkpoint(name))
-    joints = len(h1().joints)
+    joints = len(ROBOTS[robot]().joints)
     return "zero actions", lambda obs: torch.zeros(len(obs["policy"]), joints)
 
 
-def reference_model() -> mujoco.MjModel:
-    """H1 at 5 ms with feet-only contacts, whose controls are torques."""
-    model = build_model(h1(), "feet", TIMESTEP_S)
+def reference_model(robot: str = "h1") -> mujoco.MjModel:
+    """The robot at 5 ms with feet-only contacts, whose controls are torques."""
+    model = build_model(ROBOTS[robot](), "feet", TIMESTEP_S)
     model.actuator_biasprm[:] = 0.0
     return model
 
 
-def full_env(num_envs: int, threads: int, backend: str = "mjbatch") -> HumanoidEnv:
+def recipe(robot: str, stage: str = "base") -> BaseTraining:
+    """Recipe `default` of a stage."""
+    training = BASE_RECIPES["default"]()
+    training.env.robot = robot
+    return training if stage == "base" else DISTILL_RECIPES["default"](training)
+
+
+def full_env(
+    num_envs: int, threads: int, backend: str = "mjbatch", robot: str = "h1", stage: str = "base"
+) -> HumanoidEnv:
     """Everything on that recipe `default` has, as at the end of its training; envs time out at different times."""
-    cfg = BASE_RECIPES["default"]().env
+    cfg = recipe(robot, stage).env
     cfg.num_envs, cfg.num_threads, cfg.backend = num_envs, threads, backend
     env = HumanoidEnv(cfg)
-    env.samples = 10**9
+    env.samples = env.curriculum.samples = 10**9  # no wrench, and all forces at full size
     env.episode_length_buf = torch.randint_like(env.episode_length_buf, high=env.max_episode_length)
     return env
 
@@ -114,9 +128,9 @@ def record(env: HumanoidEnv, policy: Actor, warm_up: int, steps: int) -> Recordi
 class PhysicsReference:
     """Plain mjbatch on a recording; only the stepping is timed."""
 
-    def __init__(self, recording: Recording, seconds: float, threads: int) -> None:
+    def __init__(self, recording: Recording, seconds: float, threads: int, robot: str = "h1") -> None:
         self.recording, self.seconds = recording, seconds
-        self.batch = batch_of("mjbatch")(reference_model(), recording.qpos.shape[1], threads)
+        self.batch = batch_of("mjbatch")(reference_model(robot), recording.qpos.shape[1], threads)
         self.qpos, self.qvel, self.ctrl = (self.batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
 
     def run(self) -> float:
@@ -151,8 +165,10 @@ class EnvStepping:
 class Compliance:
     """Both arms of every env, from joint angles to torque: kinematics, stiffness, blend, gravity, two torques."""
 
-    def __init__(self, num_envs: int, seconds: float, law: str = "cotap", passive: bool = False) -> None:
-        self.seconds, self.num_envs, spec = seconds, num_envs, h1()
+    def __init__(
+        self, num_envs: int, seconds: float, law: str = "cotap", passive: bool = False, robot: str = "h1"
+    ) -> None:
+        self.seconds, self.num_envs, spec = seconds, num_envs, ROBOTS[robot]()
         self.arms = arm_model(spec)
         self.chains = self.arms.chains
         self.law = LAWS[law](self.arms, LawConfig(law, passive=passive))
@@ -161,7 +177,7 @@ class Compliance:
         joints = [spec.joints[i] for i in spec.indices(spec.upper_joints)]
         low, high = torch.tensor([j.range_rad for j in joints]).unbind(1)
         rng = torch.Generator().manual_seed(0)
-        self.q = (low + (high - low) * torch.rand(num_envs, 8, generator=rng)).unflatten(1, (2, 4))
+        self.q = (low + (high - low) * torch.rand(num_envs, len(low), generator=rng)).unflatten(1, (2, -1))
         self.to_heading = torch.eye(3).repeat(num_envs, 1, 1)
         shape = (num_envs, 2)
         self.parameters = LawParameters(torch.full((*shape, 3), 300.0), torch.full(shape, 25.0), torch.full(shape, 0.7))
@@ -181,8 +197,8 @@ class Compliance:
 class InverseKinematics(Compliance):
     """Joint targets of both arms of every env for hands that are 2 cm away."""
 
-    def __init__(self, num_envs: int, seconds: float) -> None:
-        super().__init__(num_envs, seconds)
+    def __init__(self, num_envs: int, seconds: float, robot: str = "h1") -> None:
+        super().__init__(num_envs, seconds, robot=robot)
         self.ik = ArmIK(self.chains, self.arms.low, self.arms.high)
         self.tip = self.chains.pose(self.q).tip + 0.0115
         self.most = 0.02 * self.arms.speed
@@ -194,30 +210,44 @@ class InverseKinematics(Compliance):
 class LiteralCompliance(Compliance):
     """The same stiffness from general-purpose parts, as a first reading of the paper would write it."""
 
-    def __init__(self, num_envs: int, seconds: float) -> None:
-        super().__init__(num_envs, seconds)
-        self.kinematics = ArmKinematics()
+    def __init__(self, num_envs: int, seconds: float, robot: str = "h1") -> None:
+        super().__init__(num_envs, seconds, robot=robot)
+        self.kinematics, self.eye = ArmKinematics(ROBOTS[robot]()), torch.eye(self.q.shape[-1])
 
     def once(self) -> None:
         jacobian = self.kinematics.jacobian(self.q)
         inverse = torch.linalg.pinv(jacobian)
         task = torch.diag_embed(1.0 / self.parameters.stiffness)
         projector = inverse @ jacobian
-        null = torch.eye(4) / 25.0
+        null = self.eye / 25.0
         transposed = projector.transpose(-1, -2)
         compliance = inverse @ task @ inverse.transpose(-1, -2) + null - projector @ null @ transposed
         stiffness = torch.linalg.inv(compliance)
         values, vectors = torch.linalg.eigh(0.5 * (stiffness + stiffness.transpose(-1, -2)))
         values = values.clamp_min(1e-3).log()
         logarithm = (vectors * values.unsqueeze(-2)) @ vectors.transpose(-1, -2)
-        torch.linalg.matrix_exp(0.7 * logarithm + 0.3 * torch.eye(4) * torch.log(torch.tensor(100.0)))
+        torch.linalg.matrix_exp(0.7 * logarithm + 0.3 * self.eye * torch.log(torch.tensor(100.0)))
+
+
+class GeneralBlend(Compliance):
+    """The log-Euclidean blend alone, of any two stiffness matrices of both arms of every env."""
+
+    def __init__(self, num_envs: int, seconds: float, robot: str = "h1") -> None:
+        super().__init__(num_envs, seconds, robot=robot)
+        jacobian, p = ArmKinematics(ROBOTS[robot]()).jacobian(self.q), self.parameters
+        gains = self.arms.kp.expand_as(self.q)
+        compliant = blended_stiffness(jacobian, p.stiffness, p.null_stiffness, gains, torch.ones(num_envs, 2))
+        self.pair = compliant.stiffness, torch.diag_embed(gains)
+
+    def once(self) -> None:
+        modulate_stiffness(*self.pair, self.parameters.alpha)
 
 
 class Reference:
     """The arms' reference: one control step of it, from so many clips."""
 
-    def __init__(self, num_envs: int, seconds: float, clips: int) -> None:
-        spec, rng = h1(), np.random.default_rng(0)
+    def __init__(self, num_envs: int, seconds: float, clips: int, robot: str = "h1") -> None:
+        spec, rng = ROBOTS[robot](), np.random.default_rng(0)
         self.seconds, self.num_envs, self.rng = seconds, num_envs, torch.Generator().manual_seed(0)
         cfg = ReferenceConfig()
         cfg.clips.share = 0.5 if clips else 0.0
@@ -251,8 +281,8 @@ def _rate(once: Callable[[], None], seconds: float) -> float:
 class PlainEnv(gymnasium.Env):
     """Bare `mj_step` of the same model behind Gymnasium's interface."""
 
-    def __init__(self) -> None:
-        self.model = reference_model()
+    def __init__(self, robot: str = "h1") -> None:
+        self.model, self.height_m = reference_model(robot), ROBOTS[robot]().base_height_m
         self.data = mujoco.MjData(self.model)
         size = self.model.nq + self.model.nv
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float64)
@@ -261,7 +291,7 @@ class PlainEnv(gymnasium.Env):
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
         super().reset(seed=seed, options=options)
         mujoco.mj_resetData(self.model, self.data)
-        self.data.qpos[2] = h1().base_height_m
+        self.data.qpos[2] = self.height_m
         return self._observation(), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
@@ -289,9 +319,9 @@ def gymnasium_rate(vector: gymnasium.vector.VectorEnv, seconds: float) -> float:
     return rate
 
 
-def rollout_rate(recording: Recording, seconds: float, threads: int) -> float:
+def rollout_rate(recording: Recording, seconds: float, threads: int, robot: str = "h1") -> float:
     """Control steps per second of `mujoco.rollout` on the recording, from its states with its torques."""
-    model = reference_model()
+    model = reference_model(robot)
     threads = threads or os.cpu_count() or 1
     data = [mujoco.MjData(model) for _ in range(threads)]
     k, n = recording.qpos.shape[:2]
@@ -329,11 +359,13 @@ def ratio(results: dict[str, list[float]], part: str, to: str = "physics") -> fl
     return statistics.median(a / b for a, b in zip(results[part], results[to], strict=True))
 
 
-def peak_memory_mib(num_envs: int) -> float:
+def peak_memory_mib(num_envs: int, threads: int, robot: str) -> float:
     """Peak resident memory of a training of two iterations, in a process of its own [MiB]."""
+    options = {"robot": robot, "num-envs": num_envs, "iterations": 2, "threads": threads}
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "cotap.train", "base", "--num-envs", str(num_envs), "--iterations", "2"]
-        subprocess.run([*command, "--run-dir", f"{folder}/run"], check=True, capture_output=True)
+        command = [sys.executable, "-m", "cotap.train", "base", f"--run-dir={folder}/run"]
+        command += [f"--{name}={value}" for name, value in options.items()]
+        subprocess.run(command, check=True, capture_output=True)
     unit = 2**20 if sys.platform == "darwin" else 2**10  # bytes there, KiB elsewhere
     return resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / unit
 
@@ -367,7 +399,7 @@ def rates_by_size(sizes: list[int], policy: Actor, options: argparse.Namespace) 
     rates: dict[str, list[float]] = {str(n): [] for n in sizes}
     for _ in range(options.repeats):
         for n in sizes:
-            stepping = EnvStepping(full_env(n, options.threads), policy, options.seconds)
+            stepping = EnvStepping(full_env(n, options.threads, robot=options.robot), policy, options.seconds)
             stepping.run()  # warm up
             rates[str(n)].append(stepping.run())
     return {n: statistics.median(values) for n, values in rates.items()}
@@ -384,38 +416,46 @@ def sizes(text: str) -> list[int]:
 def measure(options: argparse.Namespace) -> dict[str, Any]:
     """Everything that goes into the JSON."""
     torch.manual_seed(0)
-    num_envs, seconds, repeats = options.num_envs, options.seconds, options.repeats
-    name, policy = actor(options.checkpoint)
-    memory = peak_memory_mib(num_envs)  # before this process grows, whose size a child's peak begins with
-    env = full_env(num_envs, options.threads)
+    num_envs, seconds, repeats, robot = options.num_envs, options.seconds, options.repeats, options.robot
+    name, policy = actor(options.checkpoint, robot)
+    memory = peak_memory_mib(num_envs, options.threads, robot)  # before this process grows: a child's begins with it
+    env = full_env(num_envs, options.threads, robot=robot)
     recording = record(env, policy, WARM_UP_STEPS, options.steps)
     parts: dict[str, Callable[[], float]] = {
-        "physics": PhysicsReference(recording, seconds, options.threads).run,
+        "physics": PhysicsReference(recording, seconds, options.threads, robot).run,
         "env": EnvStepping(env, policy, seconds).run,
     }
-    train_env = full_env(
-        num_envs, options.threads
-    )  # of its own: an untrained policy falls, and would leave the other on the ground
+    # Of its own: an untrained policy falls, and would leave the other on the ground.
+    train_env = full_env(num_envs, options.threads, robot=robot)
     networks = {"default": "train", "paper": "train_paper"}
     for kind in options.networks:
-        parts[networks[kind]] = TimedTraining(train_env, BASE_RECIPES[kind]().ppo).run
-    parts["reference"] = Reference(num_envs, seconds, 0).run
-    parts["reference_10000_clips"] = Reference(num_envs, seconds, 10_000).run
-    parts["compliance"] = Compliance(num_envs, seconds).run
+        training = TimedTraining(train_env, BASE_RECIPES[kind]().ppo)
+        parts[networks[kind]] = training.run
+        if kind == "default":
+            distill = recipe(robot, "distill")
+            distill_env = full_env(num_envs, options.threads, robot=robot, stage="distill")
+            guide = Guide(training.alg.model, distill.distillation)
+            parts["distill"] = TimedTraining(distill_env, distill.ppo, guide=guide).run
+    parts["reference"] = Reference(num_envs, seconds, 0, robot).run
+    parts["reference_10000_clips"] = Reference(num_envs, seconds, 10_000, robot).run
+    parts["compliance"] = Compliance(num_envs, seconds, robot=robot).run
     for law in LAWS:
-        parts[f"law_{law}"] = Compliance(num_envs, seconds, law).run
-    parts["passive"] = Compliance(num_envs, seconds, passive=True).run
-    parts["inverse_kinematics"] = InverseKinematics(num_envs, seconds).run
-    parts["compliance_literal"] = LiteralCompliance(num_envs, seconds).run
-    parts["mujoco_rollout"] = lambda: rollout_rate(recording, seconds, options.threads)
-    makers = [PlainEnv] * PEER_ENVS
+        parts[f"law_{law}"] = Compliance(num_envs, seconds, law, robot=robot).run
+    parts["passive"] = Compliance(num_envs, seconds, passive=True, robot=robot).run
+    parts["inverse_kinematics"] = InverseKinematics(num_envs, seconds, robot).run
+    parts["compliance_literal"] = LiteralCompliance(num_envs, seconds, robot).run
+    parts["blend"] = GeneralBlend(num_envs, seconds, robot).run
+    parts["mujoco_rollout"] = lambda: rollout_rate(recording, seconds, options.threads, robot)
+    makers = [partial(PlainEnv, robot)] * PEER_ENVS
     parts["gymnasium_async"] = lambda: gymnasium_rate(gymnasium.vector.AsyncVectorEnv(makers), seconds)
     parts["gymnasium_sync"] = lambda: gymnasium_rate(gymnasium.vector.SyncVectorEnv(makers), seconds)
     results = rounds(parts, repeats)
     median = {name: statistics.median(rates) for name, rates in results.items()}
-    del parts, env, train_env
+    parts.clear()
+    del env, train_env
     by_size = rates_by_size(options.sizes, policy, options)
     return {
+        "robot": robot,
         "num_envs": num_envs,
         "policy": name,
         "physics_steps_per_s": median["physics"],
@@ -425,8 +465,11 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
         "env_over_physics": ratio(results, "env"),
         "train_over_physics": ratio(results, "train"),
         "train_paper_over_physics": ratio(results, "train_paper"),
+        "distill_steps_per_s": median.get("distill"),
+        "distill_over_train": ratio(results, "distill", to="train"),
         "train_note": None if len(options.networks) == 2 else f"networks measured: {', '.join(options.networks)}",
         "env_steps_per_s_by_num_envs": by_size,
+        "env_512_over_4096": by_size["512"] / by_size["4096"] if {"512", "4096"} <= by_size.keys() else None,
         "env_steps_per_s_spread": 1.0 - min(by_size.values()) / max(by_size.values()) if by_size else None,
         "clips_over_env": statistics.median(
             env / with_clips - env / without
@@ -445,6 +488,8 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
         ),
         "compliance_literal_ms": 1e3 * num_envs / median["compliance_literal"],
         "compliance_literal_over_compliance": ratio(results, "compliance", to="compliance_literal"),
+        "blend_ms": 1e3 * num_envs / median["blend"],
+        "blend_over_physics": ratio(results, "physics", to="blend"),
         "inverse_kinematics_ms": 1e3 * num_envs / median["inverse_kinematics"],
         "inverse_kinematics_over_physics": ratio(results, "physics", to="inverse_kinematics"),
         "laws_ms": {name: 1e3 * num_envs / median[f"law_{name}"] for name in LAWS},
@@ -485,6 +530,16 @@ def table(result: dict[str, Any]) -> str:
         f"| {name} | {result['laws_ms'][name]:.1f} | {over:.3f} |" for name, over in result["laws_over_physics"].items()
     ]
     laws = ["", "| law of the arms, per control step | ms | over physics |", "|---|---|---|", *laws, ""]
+    blend = (
+        f"general log-Euclidean blend of both arms: {result['blend_ms']:.1f} ms, {result['blend_over_physics']:.3f} of "
+        "a physics step"
+    )
+    shares = {
+        "train_over_physics": "training over physics",
+        "env_512_over_4096": "environment, rate at 512 envs over that at 4096",
+        "distill_over_train": "samples/s of stage 2 over those of stage 1",
+    }
+    asked = [f"{words}: {result[name]:.2f}" for name, words in shares.items() if result[name]]
     clips = f"10,000 clips beside generated arm motion cost {result['clips_over_env']:.2%} of an environment step"
     return "\n".join(
         [
@@ -492,8 +547,10 @@ def table(result: dict[str, Any]) -> str:
             *laws,
             compliance,
             passivity,
+            blend,
             ik,
             clips,
+            *asked,
             f"\npeak memory of training: {result['peak_rss_mib']:,.0f} MiB",
         ]
     )
@@ -502,6 +559,7 @@ def table(result: dict[str, Any]) -> str:
 def main() -> int:
     """Parse, measure, report."""
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--robot", choices=tuple(ROBOTS), default="h1")
     parser.add_argument("--num-envs", type=int, default=4096)
     parser.add_argument(
         "--seconds", type=float, default=3.0, help="least time per measurement; training takes one iteration"

@@ -8,6 +8,7 @@ from typing import Any
 from rsl_rl.env import VecEnv
 
 from cotap.agents.actors import as_dict
+from cotap.agents.distillation import Guide
 from cotap.agents.dual_ppo import DualPPO, DualPPOConfig
 from cotap.agents.runner import layout_of
 
@@ -19,12 +20,13 @@ class TimedTraining:
         env: Whose robots learn.
         ppo: How.
         device: Where the networks live.
+        guide: As in a distillation.
     """
 
-    def __init__(self, env: VecEnv, ppo: DualPPOConfig, device: str = "cpu") -> None:
+    def __init__(self, env: VecEnv, ppo: DualPPOConfig, device: str = "cpu", guide: Guide | None = None) -> None:
         self.env: Any = env
         self.device = device
-        self.alg = DualPPO(layout_of(env, ppo.symmetric), env.num_envs, ppo, device)
+        self.alg = DualPPO(layout_of(env, ppo.symmetric), env.num_envs, ppo, device, guide)
 
     def run(self) -> float:
         """Samples per second of one whole iteration, which collects and learns."""
