@@ -349,6 +349,22 @@ def test_an_interval_is_of_a_thousand_resamples_by_one_seed_unless_told_otherwis
         assert summarize(values) != summarize(values, *other)
 
 
+def test_of_several_figures_in_an_env_the_mean_is_over_all_and_the_interval_over_envs():
+    """A ratio of sums: its standard error is that of `sum_i - ratio count_i`, over `sqrt(n)` times the mean count."""
+    rng = torch.Generator().manual_seed(5)
+    values = torch.randn(500, 4, generator=rng) + 3.0 * torch.randn(500, 1, generator=rng) + 5.0
+    values[torch.arange(4) >= torch.randint(1, 5, (500, 1), generator=rng)] = math.nan
+    counts, totals = values.isfinite().sum(1), values.nansum(1)
+    ratio = float(totals.sum() / counts.sum())
+    error = float((totals - ratio * counts).std()) / float(counts.float().mean()) / math.sqrt(500)
+    s = summarize(values, resamples=20_000)
+    assert (s["mean"], s["n"]) == (pytest.approx(ratio, abs=1e-5), 500)
+    assert [(x - ratio) / error for x in s["ci95"]] == pytest.approx([-1.96, 1.96], abs=0.08)
+    single = values[:, :1]
+    assert summarize(single) == summarize(single[:, 0])
+    assert summarize(torch.full((3, 2), math.nan))["reason"]
+
+
 def test_events_get_wilsons_interval():
     """Against published values: 0 of 10 is 0 to 0.278, 81 of 263 is 0.255 to 0.366."""
     none = summarize(torch.zeros(10, dtype=torch.bool))

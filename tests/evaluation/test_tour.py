@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from cotap.compare import compare
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.evaluate import evaluate, main
 from cotap.evaluation.law_options import LawOptions
@@ -208,10 +209,15 @@ def test_the_command_writes_json_table_and_plot(checkpoints, robot, law, tmp_pat
 
 
 def test_the_same_seed_gives_the_same_scores(checkpoint):
-    results = [evaluate(["tour", "--checkpoint", str(checkpoint), *ARGUMENTS, "--seed", s]) for s in ("3", "3", "4")]
+    arguments = ["tour", "--checkpoint", str(checkpoint), *ARGUMENTS, "--per-env"]
+    results = [evaluate([*arguments, "--seed", s]) for s in ("3", "3", "4")]
     first, again, other = ({k: v for k, v in r.items() if k not in ("seconds", "settings")} for r in results)
     assert first == again
     assert first != other
+    rows = compare(*results[:2])["differences"]  # run by run
+    assert rows["survival_s"] | {"a": 0, "b": 0} == {"a": 0, "b": 0, "difference": 0.0, "ci95": [0.0, 0.0], "pairs": 2,
+                                                     "better": "more", "b_is": "not distinguishable"}  # fmt: skip
+    assert "pairs" not in rows["position_error"]  # which has no figure of a run
 
 
 @pytest.mark.parametrize(

@@ -85,7 +85,7 @@ def evaluate_in_engine(tour: Tour, checkpoint: Path, cfg: HumanoidEnvConfig) -> 
             tour.film = film if run == 0 else tour.film
     finally:
         engine.close()
-    return TourMeasures.join(runs).report(tour.segment_s, CONTROL_S, tour.seed)
+    return TourMeasures.join(runs).report(tour.segment_s, CONTROL_S, tour.seed, tour.per_env)
 
 
 @torch.inference_mode()

@@ -142,24 +142,30 @@ def tracking_slopes(t: Trajectory, gait_period_s: float, settle_s: float = 1.0) 
 def summarize(values: torch.Tensor, seed: int = 0, resamples: int = 1000) -> dict[str, Any]:
     """Mean, standard deviation and 95 % interval of the mean over envs, and the number of envs `n` behind them.
 
-    Numbers (N,) get a bootstrap interval, NaN envs left out. Events (N,) bool get Wilson's, which has a width even
-    where all envs agree. Where nothing could be measured the numbers are null and `reason` says so.
+    Numbers (N,) get a bootstrap interval, NaN left out; of several in an env, (N, K), the mean is over all of them, and
+    an env's stay together in the bootstrap. Events (N,) bool get Wilson's interval, which has a width even where all
+    envs agree. Where nothing could be measured the numbers are null and `reason` says so.
     """
-    counted = values[torch.isfinite(values)].double()
-    n = counted.numel()
+    values = values.unsqueeze(1) if values.dim() == 1 else values
+    known = torch.isfinite(values)
+    counts = known.sum(1)
+    n = int((counts > 0).sum())
     if n == 0:
         return {"mean": None, "std": None, "ci95": None, "n": 0, "reason": "no env had anything to measure"}
-    mean, std = float(counted.mean()), float(counted.std()) if n > 1 else 0.0
+    counted = values[known].double()
+    mean, std = float(counted.mean()), float(counted.std()) if counted.numel() > 1 else 0.0
     if values.dtype == torch.bool:
         return {"mean": mean, "std": std, "ci95": list(wilson_interval(mean, n)), "n": n}
-    means = (_resamples(n, seed, resamples) @ counted.float()) / n
+    totals = torch.where(known, values, 0.0).sum(1)
+    draws = _resamples(n, seed, resamples)
+    means = (draws @ totals[counts > 0].float()) / (draws @ counts[counts > 0].float())
     low, high = torch.quantile(means.double(), torch.tensor([0.025, 0.975], dtype=torch.float64)).tolist()
     # Single precision may put the interval of equal numbers beside them by a rounding.
     return {"mean": mean, "std": std, "ci95": [min(low, mean), max(high, mean)], "n": n}
 
 
 def summaries(measures: dict[str, torch.Tensor], keep: torch.Tensor, seed: int) -> dict[str, dict[str, Any]]:
-    """Every measure (N,) summed up over the envs in `keep` (N,)."""
+    """Every measure, (N,) or (N, K), summed up over the envs in `keep` (N,)."""
     return {name: summarize(values[keep], seed) for name, values in measures.items()}
 
 

@@ -59,6 +59,9 @@ class Tour(Protocol):
 
     engine: str = "mujoco"
     """mujoco or pybullet. mujoco runs all at once, pybullet one after the other in the loop of `cotap deploy`."""
+    per_env: bool = False
+    """Write survival, completion, energy and vibration of every run as well. `cotap compare` then compares run by
+    run."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
@@ -150,7 +153,7 @@ class Tour(Protocol):
                 break
         measures = scorer.measures()
         self.film = torch.stack(film).cpu()[: round((float(measures.survival_s[0]) + FALL_S) / env.dt)]
-        return measures.report(self.segment_s, env.dt, self.seed)
+        return measures.report(self.segment_s, env.dt, self.seed, self.per_env)
 
     def _begin(self, env: HumanoidEnv) -> TensorDict:
         """Let all robots go, asked for nothing yet; return the observations."""
@@ -186,7 +189,7 @@ class Tour(Protocol):
         ):
             ends = [(s["end_s"], s[name]["mean"]) for s in result["segments"] if s[name]["mean"] is not None]
             right.plot([t for t, _ in ends], [e for _, e in ends], "o-", ms=3, color=color, label=label)
-        right.set(xlabel="time [s]", ylabel="error at the segment's end, of runs upright")
+        right.set(xlabel="time [s]", ylabel="error at the segment's end, or at the fall")
         right.legend(frameon=False)
         for axis in (left, right):
             axis.grid(alpha=0.2)

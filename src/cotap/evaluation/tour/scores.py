@@ -8,7 +8,8 @@ from typing import Any
 
 import torch
 
-from cotap.evaluation.metrics import masked_mean, summaries, summarize
+from cotap.evaluation.disturbance import per_env_figures
+from cotap.evaluation.metrics import summaries, summarize
 
 
 @dataclass(frozen=True)
@@ -20,7 +21,7 @@ class TourMeasures:
     completed: torch.Tensor
     """(N,) bool: never fell."""
     position_error: torch.Tensor
-    """(N, W) distance of the pelvis from the waypoint at each segment's end [m]; NaN once a run has fallen."""
+    """(N, W) distance of the pelvis from the waypoint at each segment's end, or at the fall [m]; NaN after that."""
     yaw_error: torch.Tensor
     """(N, W) [rad]; the same."""
     energy: torch.Tensor
@@ -34,8 +35,9 @@ class TourMeasures:
         names = TourMeasures.__dataclass_fields__
         return TourMeasures(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names})
 
-    def report(self, segment_s: float, dt: float, seed: int) -> dict[str, Any]:
-        """The measured part of the evaluation's JSON. Energy and vibration are of runs that were completed."""
+    def report(self, segment_s: float, dt: float, seed: int, per_env: bool = False) -> dict[str, Any]:
+        """The measured part of the evaluation's JSON. Errors are means over all waypoints of all runs; energy and
+        vibration are of runs that were completed. `per_env` adds what a run has one figure of."""
         steps = round(segment_s * self.position_error.shape[1] / dt)
         time = dt * torch.arange(1, steps + 1)
         upright = (self.survival_s > time.unsqueeze(1) + 0.5 * dt) | self.completed
@@ -43,11 +45,12 @@ class TourMeasures:
         measures = {
             "survival_s": self.survival_s,
             "completed_fraction": self.completed,
-            "position_error": _mean(self.position_error),
-            "yaw_error": _mean(self.yaw_error),
+            "position_error": self.position_error,
+            "yaw_error": self.yaw_error,
             "energy": torch.where(self.completed, self.energy, nothing),
             "vibration": torch.where(self.completed, self.vibration, nothing),
         }
+        of_runs = {name: values for name, values in measures.items() if values.dim() == 1}
         ends = [
             {"end_s": segment_s * (k + 1)}
             | {name: summarize(getattr(self, name)[:, k], seed) for name in ("position_error", "yaw_error")}
@@ -60,6 +63,7 @@ class TourMeasures:
             "window": {"start": 0.0, "end": segment_s * len(ends)},
             "segments": ends,
             "curve": {"time": time.tolist(), "upright": upright.float().mean(1).tolist()},
+            **({"per_env": per_env_figures(of_runs, self.completed)} if per_env else {}),
         }
 
 
@@ -102,6 +106,10 @@ class TourScorer:
             turn: (N,) yaw error [rad].
             broken: (N,) bool: the simulation has diverged; that is a fall.
         """
+        segment = self._steps // self._segment_steps
+        known = self.standing & ~broken  # until the fall: the last one is that of the segment's end, or of the fall
+        for errors, error in ((self._position_error, way.norm(dim=1)), (self._yaw_error, turn.abs())):
+            errors[:, segment] = torch.where(known, error, errors[:, segment])
         self._survived = self._survived + self.standing  # steps
         self.standing = self.standing & (height >= self._fallen_m) & ~broken
         acceleration = (rate - self._rate) / self._dt
@@ -112,18 +120,9 @@ class TourScorer:
         self._energy = self._energy + torch.where(self.standing, work, 0.0)
         self._rate, self._acceleration = rate.clone(), acceleration
         self._steps += 1
-        if self._steps % self._segment_steps == 0:
-            segment = self._steps // self._segment_steps - 1
-            self._position_error[:, segment] = torch.where(self.standing, way.norm(dim=1), math.nan)
-            self._yaw_error[:, segment] = torch.where(self.standing, turn.abs(), math.nan)
 
     def measures(self) -> TourMeasures:
         """Of all steps so far, on the CPU."""
         errors = self._position_error, self._yaw_error
         values = (self._dt * self._survived, self.standing, *errors, self._energy, self._vibration)
         return TourMeasures(*(value.cpu() for value in values))
-
-
-def _mean(errors: torch.Tensor) -> torch.Tensor:
-    """(N,) of (N, W), NaN left out; NaN for a run with nothing else."""
-    return masked_mean(errors.T, errors.isfinite().T)
