@@ -223,3 +223,22 @@ def test_new_actions_are_zero_at_first(make_env: MakeEnv, symmetric: bool, kind:
     assert float(dict(new.actors["upper"].named_parameters())[last].grad[arms:].abs().max()) > 0.0  # they can learn
     with pytest.raises(CheckpointError, match="other networks"):
         take_over("c.pt", content(now, new), fresh(before, symmetric), before, other=REFITTED)
+
+
+@pytest.mark.parametrize("symmetric", [True, False])
+def test_laws_are_read_at_the_order_of_one_wherever_actions_bring_them(make_env: MakeEnv, symmetric: bool):
+    """Every env begins with the same law, whose spread is none; as learned, normalised ones would be 50 and more."""
+    law = LawConfig("cotap", alpha=0.5)
+    before = make_env()
+    now = make_env(16, upper_body=UpperBodyConfig(law, law, modulation=ModulationConfig("stiffness")))
+    new = fresh(now, symmetric)
+    take_over("c.pt", content(before, trained(before, symmetric)), new, now, other=REFITTED)
+    rng = torch.Generator().manual_seed(0)
+    asked = 4.0 * torch.randn(16, 8, generator=rng)  # far beyond the bounds
+    for _ in range(20):
+        now.step(torch.cat((torch.zeros(16, now.num_actions - 8), asked), 1))
+    seen = now.get_observations()["policy"]
+    law_columns = new.eval().normalizers["policy"](seen)[:, -8 * HISTORY :]
+    assert float(seen[:, -8 * HISTORY :].std(0).min()) > 0.1
+    assert float(law_columns.std(0).min()) > 0.1
+    assert float(law_columns.abs().max()) < 2.0

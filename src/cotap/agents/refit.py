@@ -63,9 +63,10 @@ def refit(
     """The state that `fresh` is to have to act as `model` did.
 
     Columns keep their weights and statistics. A term that has gone counts as being at its mean. A new one has weights
-    of zero and the statistics that `fresh` has for it. A critic takes over weights and statistics of a term that its
-    actor saw until now. New actions come after those that `model` has: their outputs are zero, and they are explored as
-    `fresh` explores them.
+    of zero and the statistics that `fresh` has for it, but a standard deviation of one at least: terms are scaled to be
+    of that order, and what envs have alike at first, as laws that actions set, has no spread yet. A critic takes over
+    weights and statistics of a term that its actor saw until now. New actions come after those that `model` has: their
+    outputs are zero, and they are explored as `fresh` explores them.
 
     Args:
         model: State of the networks that were trained.
@@ -78,6 +79,8 @@ def refit(
     for name, value in state.items():
         part, which, *_ = name.split(".")
         if part == "normalizers" and value.dim():
+            if name.endswith(("_std", "_var")):
+                value.clamp_min_(1.0)
             # A term that a critic sees from now on comes from what its actor saw; its own columns have the last word.
             for group in sorted(before, key=lambda group: group == which):
                 if (old := model.get(name.replace(which, group, 1))) is not None:
