@@ -33,8 +33,10 @@ def guided(base: DualActorCritic, cfg: DistillationConfig, **ppo: Any) -> DualPP
 
 def test_a_policy_begins_as_the_base_but_for_agents_that_begin_anew():
     base = base_policy()
-    learner = guided(base, DistillationConfig(anew=("upper",)))
+    learner = guided(base, DistillationConfig(anew=("upper",), new_std=0.7))
     learner.guide.start(learner.model)
+    torch.testing.assert_close(learner.model.log_std["upper"].exp(), torch.full((2,), 0.7))
+    assert torch.equal(learner.model.log_std["lower"], base.log_std["lower"])
     x = {"policy": torch.randn(8, 6)}
     begun, wanted = learner.model(x), base(x)
     assert torch.equal(begun[:, SLICES["lower"]], wanted[:, SLICES["lower"]])
@@ -47,6 +49,8 @@ def test_a_policy_begins_as_the_base_but_for_agents_that_begin_anew():
 def test_an_agent_that_is_not_there_cannot_begin_anew():
     with pytest.raises(ValueError, match=r"distillation\.anew 'arms' is unknown"):
         DistillationConfig(anew=("arms",)).check()
+    with pytest.raises(ValueError, match=r"distillation\.new_std must lie in .*, got 0"):
+        DistillationConfig(new_std=0.0).check()
 
 
 def test_weight_falls_linearly_to_zero():

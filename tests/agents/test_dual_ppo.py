@@ -475,6 +475,39 @@ def test_spread_is_limited_more_and_more():
     assert (again.iterations, again.samples) == (5, 250)
 
 
+def test_what_begins_wider_is_limited_from_there():
+    """One action at 1.6, one at 0.1, the rest at 0.2: by hand, 100 samples halve the bound; also after a restart."""
+    config = {"num_envs": 10, "steps": 5, "initial_std": 0.2, "std_half_life": 100.0, "least_std": 0.06}
+    learner = make_learner(**config)
+    with torch.no_grad():
+        learner.model.log_std["upper"][0], learner.model.log_std["upper"][1] = math.log(1.6), math.log(0.1)
+    learner.begin_anew()
+    for i in range(5):
+        if i == 3:
+            state = copy.deepcopy(learner.state_dict())
+            learner = make_learner(**config)
+            learner.load_state_dict(state)
+        with torch.no_grad():
+            for log_std in learner.model.log_std.values():
+                log_std.fill_(1.0)
+        collect(learner)
+        learner.update()
+        share = 0.5 ** (0.5 * (i + 1))
+        std = learner.model.log_std["upper"].detach().exp()
+        assert float(std[0]) == pytest.approx(1.6 * share)
+        assert float(std[1]) == pytest.approx(max(0.2 * share, 0.06))
+        assert float(learner.model.log_std["lower"].detach().exp().max()) == pytest.approx(max(0.2 * share, 0.06))
+
+
+@pytest.mark.parametrize(
+    ("begun", "message"), [([0.5], "begun_std.lower has 1 actions, expected 3"), ([NAN] * 3, "begun_std.lower .* nan")]
+)
+def test_exploration_of_other_actions_is_refused(begun: list[float], message: str):
+    learner = make_learner()
+    with pytest.raises(ValueError, match=message):
+        learner.load_state_dict(learner.state_dict() | {"begun_std": {"lower": begun}})
+
+
 def test_trained_networks_go_on_slowly():
     learner = make_learner(initial_std=0.5)
     before = {name: value.clone() for name, value in learner.model.state_dict().items()}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import hashlib
+import math
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -27,11 +28,14 @@ class DistillationConfig:
     """Agents that are guided."""
     anew: tuple[str, ...] = ()
     """Agents whose actions begin at zero, all else as the base has it."""
+    new_std: float = 0.6
+    """Standard deviation at the start of actions that begin anew: those of `anew`, and those that the base lacks."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
         require_range("distillation.beta", self.beta, 0.0, 1e3)
         require_range("distillation.end_iterations", self.end_iterations, 1, 10**9)
+        require_range("distillation.new_std", self.new_std, 1e-8, 1e6)
         for field in ("agents", "anew"):
             for name in getattr(self, field):
                 require_one_of(f"distillation.{field}", name, ("lower", "upper"))
@@ -53,11 +57,13 @@ class Guide:
             parameter.requires_grad_(False)
         self._fingerprint = self.fingerprint()
 
+    @torch.no_grad()
     def start(self, model: DualActorCritic) -> None:
-        """Give `model` the base's weights, but for the outputs of agents that begin anew."""
+        """Give `model` the base's weights, but for outputs and exploration of agents that begin anew."""
         model.load_state_dict(self.model.state_dict())
         for name in self.cfg.anew:
             cast(Head | SymmetricHead, model.actors[name]).answer_zero()
+            model.log_std[name].fill_(math.log(self.cfg.new_std))
 
     def fingerprint(self) -> str:
         """SHA-256 of the frozen policy's bytes, tensor by tensor in the order of their names."""

@@ -129,6 +129,7 @@ class DualPPO:
         self.dtype = resolve_precision(cfg.precision, device)
         self.names = tuple(layout.action_slices)
         self.model = DualActorCritic(layout, cfg.hidden, cfg.initial_std).to(device)
+        self._begun_std = {name: [0.0] * len(own) for name, own in self.model.log_std.items()}
         discounts = [cfg.upper_gamma if name == "upper" else cfg.gamma for name in self.names]
         self._discount = torch.tensor(discounts, device=device)
         self.learning_rates = dict.fromkeys(self.names, cfg.learning_rate)
@@ -263,9 +264,10 @@ class DualPPO:
     @torch.no_grad()
     def _limit_std(self) -> None:
         cfg = self.cfg
-        largest = max(cfg.least_std, cfg.initial_std * 0.5 ** (self.samples / cfg.std_half_life))
-        for log_std in self.model.log_std.values():
-            log_std.clamp_(max=math.log(max(largest, 1e-8)))
+        share = 0.5 ** (self.samples / cfg.std_half_life)
+        for name, log_std in self.model.log_std.items():
+            largest = [max(cfg.least_std, max(cfg.initial_std, begun) * share) for begun in self._begun_std[name]]
+            log_std.clamp_(max=torch.tensor([math.log(std) for std in largest], device=log_std.device))
 
     def _update_agent(
         self, name: str, g: int, actor_in: torch.Tensor, critic_in: torch.Tensor, batch: dict[str, torch.Tensor],
@@ -311,21 +313,27 @@ class DualPPO:
 
     def begin_anew(self) -> None:
         """Start with networks that are trained and optimisers that are not: from the lowest rate, since Adam's first
-        steps are as large as its rate, whatever the gradient. Rates grow by themselves where a policy hardly moves."""
+        steps are as large as its rate, whatever the gradient. Rates grow by themselves where a policy hardly moves.
+
+        An action whose standard deviation is wider than `initial_std` by now is limited from there on."""
         self.learning_rates = dict.fromkeys(self.names, LOWEST_RATE)
+        self._begun_std = {name: own.detach().exp().tolist() for name, own in self.model.log_std.items()}
 
     def state_dict(self) -> dict[str, Any]:
-        """Optimisers, learning rates, numbers of iterations and samples; the networks are saved apart."""
+        """Optimisers, learning rates, numbers of iterations and samples, and what exploration began with; the networks
+        are saved apart."""
         return {
             "optimizers": {name: opt.state_dict() for name, opt in self.optimizers.items()},
             "learning_rates": dict(self.learning_rates),
             "iterations": self.iterations,
             "samples": self.samples,
+            "begun_std": self._begun_std,
             "guide": self.guide.state_dict() if self.guide else {},
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over what `state_dict` returned. Raises ValueError for moments of another size than the weights."""
+        """Take over what `state_dict` returned. Raises ValueError for moments of another size than the weights, or
+        other actions."""
         for name, opt in self.optimizers.items():
             # How Adam steps is its own affair; what it has learned comes from the file.
             opt.load_state_dict(opt.state_dict() | {"state": state["optimizers"][name]["state"]})
@@ -337,5 +345,9 @@ class DualPPO:
             for name in self.names
         }
         self.iterations, self.samples = int(state["iterations"]), int(state["samples"])
+        for name, begun in state.get("begun_std", {}).items():  # older checkpoints lack it
+            if len(begun) != len(self._begun_std[name]):
+                raise ValueError(f"begun_std.{name} has {len(begun)} actions, expected {len(self._begun_std[name])}")
+            self._begun_std[name] = [require_range(f"begun_std.{name}", std, 0.0, 1e6) for std in begun]
         if self.guide and state["guide"]:
             self.guide.load_state_dict(state["guide"])
