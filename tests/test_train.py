@@ -18,9 +18,9 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from cotap import __version__, pipeline, train
-from cotap.agents.checkpoint import load_checkpoint, save_checkpoint
+from cotap.agents.checkpoint import load_checkpoint, save_checkpoint, sha256
 from cotap.agents.runner import sole_writer
-from cotap.configs import BASE_RECIPES, DISTILL_RECIPES, BaseTraining, from_plain, to_plain
+from cotap.configs import BASE_RECIPES, DISTILL_RECIPES, BaseTraining, from_plain
 from cotap.envs import HumanoidEnv
 from cotap.envs.rewards import LowerRewards, UpperRewards
 from cotap.evaluation import policy
@@ -562,16 +562,41 @@ def test_every_recipe_distils(checkpoint: Path, tmp_path: Path, recipe: str):
     assert training.ppo.initial_std == expected.ppo.initial_std
 
 
-def test_distilling_from_a_distilled_policy_is_refused(
-    checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
-    path, content = checkpoint.with_name("distilled.pt"), load_checkpoint(checkpoint)
-    distilled = to_plain(DISTILL_RECIPES["default"](BaseTraining()))
-    save_checkpoint(path, content | {"kind": "distill", "config": content["config"] | {"training": distilled}})
-    before = tree(tmp_path)
-    assert run("distill", BASE_CHECKPOINT, path, RUN_DIR, tmp_path / "run", ENVS, 8) == 2
-    assert "is of stage 'distill', not 'base'" in capsys.readouterr().err
-    assert tree(tmp_path) == before
+def test_a_modulation_begins_as_a_distilled_policy_and_goes_on(checkpoint: Path, tmp_path: Path):
+    """From the policy of a distillation, as its guide, with that policy's past in the record of its own."""
+    first = distill(tmp_path / "distilled", checkpoint, "--ppo.initial-std", 0.2)
+    start = shipped(tmp_path, first)
+    folder = tmp_path / "modulated"
+    slowly = ["--ppo.learning-rate", 1e-5, "--ppo.epochs", 1, "--ppo.mini-batches", 1]
+    content = distill(folder, start, RECIPE, "modulated", *slowly)
+    training = content["config"]["training"]
+    assert (content["kind"], training["env"]["upper_body"]["modulation"]["kind"]) == ("distill", "stiffness")
+    assert training["env"]["rewards"]["lower"] == first["config"]["training"]["env"]["rewards"]["lower"]
+    guide, was = content["learner"]["guide"], first["model"]
+    for name, value in was.items():
+        if name.startswith("actors.lower") and not name.endswith("weights.0"):
+            assert torch.equal(guide[name], value), name
+            torch.testing.assert_close(content["model"][name], value, atol=1e-3, rtol=0)
+    arms = len(was["log_std.upper"])
+    assert torch.equal(guide["log_std.upper"][:arms], was["log_std.upper"])
+    assert torch.equal(guide["log_std.upper"][arms:], torch.zeros(8))  # a standard deviation of one
+    assert content["learner"]["begun_std"]["upper"][arms:] == [1.0] * 8
+    assert float(content["model"]["log_std.upper"][arms:].exp().min()) > 0.9  # not cut down to the trained actions'
+    assert content["layout"]["modulation"]["targets"][0] == "left alpha"
+    base = content["config"]["base"]
+    assert base["sha256"] == sha256(start)
+    assert RUN_DIR in base["runs"][-1]["command"]
+    assert base["base"] == first["config"]["base"]
+    assert [len(base["runs"]), len(base["base"]["runs"])] == [1, 1]
+    scalars = EventAccumulator(str(folder)).Reload()
+    assert scalars.Scalars("law/asked_alpha")[0].value == pytest.approx(0.75, abs=0.2)
+    assert 80.0 < scalars.Scalars("law/asked_stiffness")[0].value < 1200.0
+    assert {"law/store_energy", "law/held_back"} <= set(scalars.Tags()["scalars"])
+    start.unlink()
+    assert run("distill", RESUME, "auto", RUN_DIR, folder, ITERATIONS, 3) == 0
+    resumed = newest(folder)
+    assert resumed["config"]["base"] == base
+    assert resumed["learner"]["begun_std"] == content["learner"]["begun_std"]
 
 
 def tiny_networks(monkeypatch: pytest.MonkeyPatch) -> None:

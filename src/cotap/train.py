@@ -77,8 +77,8 @@ class DistillOptions:
     """Checkpoint to go on from, or auto. auto takes the newest in --run-dir, if there is one. The configuration of the
     run is the default for every option."""
     base_checkpoint: str = ""
-    """Base policy to start from: a file, or a shipped policy's name. It guides the new policy as well. By default the
-    shipped base policy."""
+    """Policy to start from, a base or a distilled one: a file, or a shipped policy's name. It guides the new policy as
+    well. By default the shipped base policy."""
     recipe: str = "default"
     """default, quick, paper, short, facet, modulated, no-ratio, torque-critic or goals. default: 80 to 1200 N/m. quick
     and short: the same, 15 M and 40 M samples. paper: 150 to 450 N/m. facet: arms under PD, FACET's tracking reward.
@@ -224,23 +224,22 @@ def _resumed_config(checkpoint: str, recipe: str, stage: str, kind: type[Any]) -
 
 
 def _base_config(checkpoint: str) -> BaseTraining:
-    """The config of a base policy, for as many samples as it was trained on, but for rewards that are not known here.
-    Raises CheckpointError for another one."""
-    from cotap.agents.checkpoint import CheckpointError, load_checkpoint, require_parts
+    """The config of a policy to begin from, for as many samples as it was trained on, but for rewards that are not
+    known here. Raises CheckpointError for one that cannot be used."""
+    from cotap.agents.checkpoint import load_checkpoint, require_parts
     from cotap.agents.run_log import say
     from cotap.configs.saved import without_unknown_terms
 
     content = load_checkpoint(checkpoint)
     require_parts(checkpoint, content, ("kind", "layout", "model", "samples", "config"))
-    if content["kind"] != "base":
-        raise CheckpointError(f"checkpoint {checkpoint!r} is of stage {quoted(content['kind'])}, not 'base'")
     plain = content["config"].get("training")
     unknown: list[str] = []
     if isinstance(plain, dict) and "env" in plain:
         plain["env"], unknown = without_unknown_terms(plain["env"])
     if unknown:
         say(f"{checkpoint}: trained with rewards that are not known here and are left out: {', '.join(unknown)}")
-    training = _config_of(checkpoint, content, BaseTraining)
+    kind = DistillTraining if content["kind"] == "distill" else BaseTraining
+    training = _config_of(checkpoint, content, kind)
     training.train_for(content["samples"])
     return training
 
@@ -330,17 +329,18 @@ def _train(stage: str, options: BaseOptions | DistillOptions, base: dict[str, An
 
 
 def _origin(options: BaseOptions | DistillOptions) -> dict[str, Any]:
-    """What a run's config says of where it comes from: the runs before it, and the base of a distillation."""
+    """What a run's config says of where it comes from: the runs before it, and the base of a distillation, which may
+    have a base itself."""
     from cotap.agents.checkpoint import load_checkpoint, sha256
 
+    begun_from = options.base_checkpoint if isinstance(options, DistillOptions) else ""
+    if not (before := options.resume or begun_from):
+        return {}
+    content = load_checkpoint(before)
+    older = {"base": content["config"]["base"]} if "base" in content["config"] else {}
     if options.resume:
-        content = load_checkpoint(options.resume)
-        before = {"base": content["config"]["base"]} if "base" in content["config"] else {}
-        return {"earlier_runs": _runs(content), **before}
-    if isinstance(options, DistillOptions) and options.base_checkpoint:
-        content = load_checkpoint(options.base_checkpoint)
-        return {"base": {"sha256": sha256(options.base_checkpoint), "runs": _runs(content)}}
-    return {}
+        return {"earlier_runs": _runs(content), **older}
+    return {"base": {"sha256": sha256(before), "runs": _runs(content), **older}}
 
 
 def _runs(content: dict[str, Any]) -> list[dict[str, Any]]:
@@ -359,7 +359,8 @@ def _guide(env: Any, options: DistillOptions, base: dict[str, Any] | None) -> An
     from cotap.agents.runner import layout_of
 
     training = options.training
-    model = DualActorCritic(layout_of(env, training.ppo.symmetric), training.ppo.hidden, training.ppo.initial_std)
+    layout = layout_of(env, training.ppo.symmetric)
+    model = DualActorCritic(layout, training.ppo.hidden, training.distillation.new_std)
     if base is not None and take_over(options.base_checkpoint, base, model, env, REFITTED):
         say("the networks see or do something else than the base's, which were refitted to that")
     return Guide(model.to(training.device), training.distillation)

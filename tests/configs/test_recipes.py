@@ -244,6 +244,16 @@ def test_exploration_goes_on_from_where_a_base_that_stopped_early_left_it():
     assert DISTILL_RECIPES["default"](base).ppo.initial_std == pytest.approx(base.ppo.initial_std / 2, rel=1e-3)
 
 
+def test_what_begins_anew_explores_as_widely_as_the_first_run_did():
+    base = BASE_RECIPES["default"]()
+    base.ppo.initial_std = 0.7
+    first = DISTILL_RECIPES["default"](base)
+    second = DISTILL_RECIPES["default"](first)
+    assert first.distillation.new_std == second.distillation.new_std == 0.7
+    assert first.ppo.initial_std == second.ppo.initial_std == base.ppo.least_std
+    assert DISTILL_RECIPES["modulated"](first).distillation.new_std == 1.0
+
+
 def test_facets_reward_is_that_of_both_stages():
     weights = DISTILL_RECIPES["facet"](BASE_RECIPES["facet"]()).env.rewards.upper
     assert (weights.track_hands_as_facet, weights.track_key_points) == (1.3, 0.0)
@@ -293,12 +303,15 @@ def test_arms_begin_at_their_reference_where_a_zero_action_asks_for_it(base: str
 
 
 def test_a_modulated_policy_begins_in_the_middle_and_is_paid_for_the_task():
-    """60 M samples; what does not give way to a push, or draws what the policy sets, is off."""
+    """60 M samples, through an energy store; what does not give way to a push, or draws what the policy sets, is
+    off."""
     training = DISTILL_RECIPES["modulated"](BASE_RECIPES["default"]())
     env, ppo = training.env, training.ppo
     assert training.runner.iterations * ppo.steps * env.num_envs == pytest.approx(60e6, rel=1e-3)
     laws = env.upper_body
-    assert (laws.modulation.kind, laws.left.alpha, laws.right.alpha) == ("stiffness", 0.5, 0.5)
+    assert (laws.modulation.kind, laws.left.alpha, laws.right.alpha) == ("stiffness", 0.75, 0.75)
+    assert laws.left.passive
+    assert laws.right.passive
     assert not laws.sampling.enabled
     weights = env.rewards.upper
     assert max(weights.free_hand_error, weights.loaded_hand_error, weights.push_resistance) < 0.0

@@ -76,6 +76,9 @@ def _after_base(training: DistillTraining, base: BaseTraining) -> None:
     env.forces.pushes.ramp, env.forces.hand_loads.ramp = RampConfig(), RampConfig()
     halvings = base.samples / base.ppo.std_half_life
     training.ppo.initial_std = max(base.ppo.least_std, base.ppo.initial_std * 0.5**halvings)
+    # What begins anew explores as widely as the first run did.
+    distilled = isinstance(base, DistillTraining)
+    training.distillation.new_std = base.distillation.new_std if distilled else base.ppo.initial_std
 
 
 def short(base: BaseTraining) -> DistillTraining:
@@ -118,16 +121,17 @@ def facet(base: BaseTraining) -> DistillTraining:
 
 
 def modulated(base: BaseTraining) -> DistillTraining:
-    """The upper agent sets alpha and stiffness itself, for a task in which that pays (`cotap.envs.arm_task`); 60 M
-    samples."""
+    """The upper agent sets alpha and stiffness itself, through an energy store, for a task in which that pays
+    (`cotap.envs.arm_task`); best begun from a policy that is distilled already; 60 M samples."""
     training = default(base)
-    env, law = training.env, LawConfig(name="cotap", alpha=0.5)
+    env, law = training.env, LawConfig(name="cotap", alpha=0.75, passive=True)
     env.upper_body = UpperBodyConfig(law, copy.deepcopy(law), modulation=ModulationConfig("stiffness"))
     env.forces = task_forces()
     for name, weight in TASK_WEIGHTS.items():
         setattr(env.rewards.upper, name, weight)
     env.rewards.upper.track_arms = env.rewards.upper.track_key_points = 0.0  # which would not give way
     training.distillation.anew = ()
+    training.distillation.new_std = 1.0  # of what is asked of the laws, whose rates smooth it
     training.ppo.upper_gamma = 0.97  # a hand that gave way takes half a second to return
     training.train_for(60e6)
     return training

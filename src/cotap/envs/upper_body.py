@@ -137,7 +137,7 @@ class UpperBody(Stateful):
         self._hold_s = torch.zeros(n)
         self._torso = _TorsoModel(cfg.torso, spec, dtype)
         self.log: dict[str, torch.Tensor] = {}
-        """Means over envs and arms of what the laws report about the last step."""
+        """Means over envs and arms of what the laws report about the last step, and of what policies ask of them."""
         self.report: dict[str, torch.Tensor] = {}
         """The same of every arm (N, A); NaN where its law reports nothing of that name."""
 
@@ -225,6 +225,9 @@ class UpperBody(Stateful):
         )
         new, self.report = self._ask(arms)
         self.log = {f"/law/{name}": values.nanmean() for name, values in self.report.items()}
+        if self.modulation.active:
+            p = self.parameters
+            self.log |= {"/law/asked_alpha": p.alpha.mean(), "/law/asked_stiffness": p.stiffness.log().mean().exp()}
         tensors = (new.anchor, new.feedforward, new.elastic, new.stiffness, new.damping)
         for name, value in zip(self.PAIRED, tensors, strict=True):
             held: torch.Tensor = getattr(self, name)
