@@ -17,10 +17,12 @@ from cotap.evaluation.rollout import idle
 def result(**changes: torch.Tensor) -> FidelityResult:
     fields = {
         "axis": torch.tensor([0, 0, 1, 1, 2, 2]),
+        "pose": torch.tensor([0, 1, 0, 1, 0, 1]),
         "stiffness": torch.full((6,), 200.0),
         "way": torch.tensor([1.0, 1.0, 0.5, 0.5, 1.0, 9.0]),
         "fell": torch.tensor([False] * 5 + [True]),
         "unholdable": torch.tensor([False] * 6),
+        "touching": torch.tensor([False] * 6),
         "saturated": torch.tensor([True] + [False] * 5),
     }
     return FidelityResult(**(fields | changes))
@@ -67,6 +69,52 @@ def test_hands_that_go_against_the_load_are_counted_and_shown(tmp_path):
     assert (tmp_path / "plot.png").stat().st_size > 5000
 
 
+def test_hands_whose_arm_touches_the_body_are_left_out_and_counted():
+    """The hand that is twice too stiff leans on the body: what is left is as it should be."""
+    touching = torch.tensor([False, False, True, True, False, False])
+    out = summary(result(touching=touching), 0.8, Fidelity(stiffness_values=(200.0,)))
+    assert (out["num_touching"], out["largest_error"], out["error_quantiles"]["95"]) == (2, 0.0, 0.0)
+    content = out | {"num_falls": 1, "num_envs": 6, "protocol": "fidelity", "method": "cotap", "arms": "held"}
+    assert "2 hands whose arm touched the body, left out" in table(content)
+
+
+def test_intervals_are_over_poses():
+    """Twelve equal hands of each of two poses are two figures: a sample has one of them, or both."""
+    error = torch.tensor([0.1, 0.5]).repeat_interleave(12)
+    way, pose = 1.0 / (1.0 + error), torch.arange(2).repeat_interleave(12)
+    fields = {"axis": torch.arange(24) % 3, "stiffness": torch.full((24,), 200.0), "way": way, "pose": pose}
+    none = {name: torch.zeros(24, dtype=torch.bool) for name in ("fell", "unholdable", "touching", "saturated")}
+    out = summary(result(**fields, **none), 0.8, Fidelity(stiffness_values=(200.0,)))
+    assert out["metrics"]["stiffness_error"]["mean"] == pytest.approx(0.3)
+    assert out["metrics"]["stiffness_error"]["ci95"] == pytest.approx([0.1, 0.5])
+    assert out["error_quantiles_ci95"] == {"50": pytest.approx([0.1, 0.5]), "95": pytest.approx([0.1, 0.5])}
+
+
+def test_a_quantile_s_interval_is_that_of_order_statistics():
+    """Of 400 poses with one hand each: the 95th percentile lies between the 371st and the 388th error, by the
+    binomial distribution (380 +- 1.96 x 4.36)."""
+    n = 400
+    fields = {"axis": torch.zeros(n), "pose": torch.arange(n), "stiffness": torch.full((n,), 200.0),
+              "way": 1.0 / (1.0 + torch.arange(1, n + 1) / n)}  # fmt: skip
+    none = {name: torch.zeros(n, dtype=torch.bool) for name in ("fell", "unholdable", "touching", "saturated")}
+    out = summary(result(**fields, **none), 0.8, Fidelity(stiffness_values=(200.0,)))
+    assert out["error_quantiles_ci95"]["95"] == pytest.approx([371.5 / n, 388.5 / n], abs=2.0 / n)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("collision", "touching"), [("full", True), ("feet", False)])
+def test_an_arm_inside_the_body_is_found(collision, touching, monkeypatch):
+    """A pose of the motion library in which the forearm leans on the pelvis."""
+    pose = torch.tensor([[0.11, 0.0, -1.07, 0.16, 0.31, -0.14, 0.65, 0.56]])
+    monkeypatch.setattr("cotap.evaluation.fidelity.library_poses", lambda *_: pose)
+    protocol = Fidelity(num_envs=3, stiffness_values=(100.0,), pelvis="fixed", settle_seconds=2.0)
+    cfg = protocol.configure(HumanoidEnvConfig(num_threads=1, collision=collision))
+    cfg.upper_body = LawOptions(method="cotap").configure()
+    env = HumanoidEnv(cfg)
+    found, _ = measure(env, protocol, idle(env))
+    assert found.touching.tolist() == [touching] * 3
+
+
 def test_condition_numbers_are_those_of_mujocos_jacobian(model, spec):
     import mujoco
     import numpy as np
@@ -97,6 +145,7 @@ def test_arms_alone_are_as_stiff_as_they_are_asked_to_be(error, allowed):
     found, coverage = measure(env, protocol, idle(env))
     assert 0.3 < coverage <= 1.0
     assert found.counted.sum() >= 4
+    assert found.pose.tolist() == [0, 0, 0, 1, 1, 1]
     out = summary(found, coverage, protocol)
     assert out["largest_error"] < allowed
 

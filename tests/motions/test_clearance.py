@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from cotap.motions.clearance import STEP_RAD, clear_range
+from cotap.motions.clearance import STEP_RAD, clear_range, touching
 from cotap.motions.generator import MotionConfig, MotionGenerator
 from cotap.robots import ROBOTS
 from cotap.robots.mjcf import build_model
@@ -74,3 +74,27 @@ def test_no_bound_moves_where_shapes_meet_in_the_default_pose_only(any_spec):
     default = torch.tensor([any_spec.joints[i].default_rad for i in any_spec.indices(any_spec.upper_joints)])
     for side in clear_range(any_spec, default, default):
         torch.testing.assert_close(side, default)
+
+
+def test_an_arm_that_touches_the_body_is_told_from_one_that_is_free(any_spec, model):
+    """As MuJoCo's contacts after mj_forward have it, body by body; the other arm's contacts are its own."""
+    low, high = wide(any_spec)
+    poses = low + (high - low) * torch.rand(40, len(low), generator=torch.Generator().manual_seed(0))
+    data, address = mujoco.MjData(model), [model.joint(name).qposadr[0] for name in any_spec.upper_joints]
+    moved_by = {body.name: body.joint for body in any_spec.bodies}
+    qpos = np.tile(data.qpos, (40, 1))
+    qpos[:, address] = poses.numpy()
+    expected = np.zeros((len(any_spec.arms), 40), dtype=bool)
+    for i, pose in enumerate(qpos):
+        data.qpos[:] = pose
+        mujoco.mj_forward(model, data)
+        for contact in data.contact:
+            joints = [moved_by.get(model.body(model.geom_bodyid[geom]).name) for geom in contact.geom]
+            for side, arm in enumerate(any_spec.arms):
+                expected[side, i] |= contact.dist < 0.0 and (joints[0] in arm.joints) != (joints[1] in arm.joints)
+    assert 0.1 < expected.mean() < 0.9
+    for side, touched in enumerate(expected):
+        assert touching(model, any_spec, side, torch.from_numpy(qpos)).tolist() == touched.tolist()
+    assert not touching(build_model(any_spec, "feet"), any_spec, 0, torch.from_numpy(qpos)).any()
+    qpos[:, address] = [any_spec.joints[i].default_rad for i in any_spec.indices(any_spec.upper_joints)]
+    assert not touching(model, any_spec, 0, torch.from_numpy(qpos[:1])).any()

@@ -15,16 +15,20 @@ from cotap.compliance.dynamics import gravity_torque
 from cotap.compliance.laws import WITHOUT_STIFFNESS
 from cotap.envs import HumanoidEnv
 from cotap.evaluation.law_options import LawOptions
-from cotap.evaluation.metrics import summarize
+from cotap.evaluation.metrics import bootstrap_draws, summarize
 from cotap.evaluation.report import heading, pyplot, save_figure
 from cotap.evaluation.rollout import PolicyFunction, acting
 from cotap.evaluation.static import HeldLoad, settle
+from cotap.motions.clearance import touching
 from cotap.motions.reference import ClipConfig, load_clips
 from cotap.robots import RobotSpec
 from cotap.robots.chains import arm_chains, arm_inertias
 
 HOLDABLE = 0.9
-"""Loads that ask an arm joint for more than this share of its torque limit are not tried."""
+"""Hands whose load asks an arm joint for more than this share of its torque limit do not count."""
+
+QUANTILES = {"50": 0.5, "95": 0.95}
+"""Of the errors of single hands, by name."""
 
 
 @dataclass
@@ -87,6 +91,8 @@ class FidelityResult:
 
     axis: torch.Tensor
     """(W,) 0, 1 or 2."""
+    pose: torch.Tensor
+    """(W,) number of the pose, which one env of every axis and stiffness has."""
     stiffness: torch.Tensor
     """(W,) commanded [N/m]."""
     way: torch.Tensor
@@ -95,6 +101,8 @@ class FidelityResult:
     """(W,) bool."""
     unholdable: torch.Tensor
     """(W,) bool: the load asks for more torque than the arm is trusted with; left out."""
+    touching: torch.Tensor
+    """(W,) bool: the arm touches the body, which then holds the hand, before the load or under it; left out."""
     saturated: torch.Tensor
     """(W,) bool: an arm joint was at its torque limit at the end."""
     film: torch.Tensor = field(default_factory=lambda: torch.zeros(0, 0))
@@ -103,7 +111,7 @@ class FidelityResult:
     @property
     def counted(self) -> torch.Tensor:
         """(W,) bool: envs that say something about stiffness."""
-        return ~(self.fell | self.unholdable)
+        return ~(self.fell | self.unholdable | self.touching)
 
 
 def conditions(joints: torch.Tensor, spec: RobotSpec) -> torch.Tensor:
@@ -140,7 +148,10 @@ def measure(env: HumanoidEnv, protocol: Fidelity, policy: PolicyFunction) -> tup
     unholdable = _torque_share(env, pose, side, force_h) > HOLDABLE
     settled = settle(env, acting(env, policy, protocol.upper_actions), protocol.settle_seconds, side)
     way = (settled.moved * direction).sum(1) / protocol.displacement
-    result = FidelityResult(axis, stiffness, way, settled.fell, unholdable, settled.saturated, settled.film)
+    touched = torch.stack([touching(env.sim.model, env.spec, side, qpos) for qpos in settled.qpos]).any(0)
+    result = FidelityResult(
+        axis, number, stiffness, way, settled.fell, unholdable, touched & ~settled.fell, settled.saturated, settled.film
+    )
     return result, float(good.float().mean())
 
 
@@ -156,6 +167,7 @@ def _torque_share(env: HumanoidEnv, pose: torch.Tensor, side: int, force: torch.
 
 def summary(result: FidelityResult, coverage: float, protocol: Fidelity) -> dict[str, Any]:
     """The measured part of the evaluation's JSON. Errors are of the felt stiffness, as shares of the commanded one.
+    Intervals are over poses, each of which every axis and stiffness has once.
 
     A hand that did not go where the load is has an error without bound: such hands are `num_wrong_way`, and what they
     leave without a bound, a mean, a quantile or `largest_error`, is null.
@@ -165,7 +177,7 @@ def summary(result: FidelityResult, coverage: float, protocol: Fidelity) -> dict
         for level in protocol.stiffness_values:
             mine = result.counted & (result.axis == axis) & (result.stiffness == level)
             rows.append({"axis": name, "stiffness": level, **_error(result.way[mine], protocol.seed)})
-    way = result.way[result.counted]
+    way, pose = result.way[result.counted], result.pose[result.counted]
     wrong = way <= 0.0
     # No stiffness, however large, moves a hand against its load: the error of one that went so has no bound.
     error = torch.where(wrong, math.inf, (1.0 / way - 1.0).abs())
@@ -174,20 +186,22 @@ def summary(result: FidelityResult, coverage: float, protocol: Fidelity) -> dict
     return {
         "coverage": coverage,
         "num_unholdable": int(result.unholdable.sum()),
+        "num_touching": int(result.touching.sum()),
         "num_saturated": int((result.saturated & result.counted).sum()),
         "num_wrong_way": int(wrong.sum()),
         "fidelity": rows,
         "largest_error": max(bounded) if measured and len(bounded) == len(measured) else None,
-        "metrics": {"stiffness_error": _mean_error(error, protocol.seed)},
+        "metrics": {"stiffness_error": _mean_error(error, pose, protocol.seed)},
         "error_quantiles": _quantiles(error),
+        "error_quantiles_ci95": _quantile_intervals(error, pose, protocol.seed),
     }
 
 
-def _mean_error(error: torch.Tensor, seed: int) -> dict[str, Any]:
+def _mean_error(error: torch.Tensor, pose: torch.Tensor, seed: int) -> dict[str, Any]:
     """As `summarize`; no mean where an error has no bound, and `n` of those that have one."""
     bounded = torch.isfinite(error)
     if bounded.all():
-        return summarize(error, seed)
+        return summarize(error, seed, group=pose)
     n = int(bounded.sum())
     reason = f"{len(error) - n} of {len(error)} hands did not go where the load is: their error has no bound"
     return {"mean": None, "std": None, "ci95": None, "n": n, "reason": reason}
@@ -198,8 +212,28 @@ def _quantiles(error: torch.Tensor) -> dict[str, float | None] | None:
     if len(error) == 0:
         return None
     between = "linear" if torch.isfinite(error).all() else "higher"  # nothing lies between a number and infinity
-    values = {name: float(error.quantile(q, interpolation=between)) for name, q in (("50", 0.5), ("95", 0.95))}
-    return {name: value if math.isfinite(value) else None for name, value in values.items()}
+    return {name: _bounded(error.quantile(q, interpolation=between)) for name, q in QUANTILES.items()}
+
+
+def _quantile_intervals(
+    error: torch.Tensor, pose: torch.Tensor, seed: int, resamples: int = 1000
+) -> dict[str, list[float | None]] | None:
+    """95 % intervals of the same, by a bootstrap that draws poses; null for a bound that is none."""
+    if len(error) == 0:
+        return None
+    poses, member = torch.unique(pose, return_inverse=True)
+    error, order = error.sort()
+    weight = bootstrap_draws(len(poses), seed, resamples)[:, member[order]].cumsum(1)
+    intervals = {}
+    for name, q in QUANTILES.items():
+        at = (weight < q * weight[:, -1:]).sum(1)  # the first error that so large a share does not exceed
+        ends = (error[at].quantile(p, interpolation="nearest") for p in (0.025, 0.975))
+        intervals[name] = [_bounded(end) for end in ends]
+    return intervals
+
+
+def _bounded(value: torch.Tensor) -> float | None:
+    return float(value) if math.isfinite(value) else None
 
 
 def _error(way: torch.Tensor, seed: int) -> dict[str, Any]:
@@ -233,6 +267,7 @@ def table(content: dict[str, Any]) -> str:
         f"{content['num_falls']} of {content['num_envs']} envs fell",
         f"{content['num_wrong_way']} hands did not go where the load is",
         f"{content['num_unholdable']} loads beyond the arm's torque",
+        f"{content['num_touching']} hands whose arm touched the body, left out",
         f"poses cover {content['coverage']:.0%} of the motion library's time",
     ]
     return "\n".join([*lines, "", f"{heading(content)}: {'; '.join(notes)}"])

@@ -139,26 +139,35 @@ def tracking_slopes(t: Trajectory, gait_period_s: float, settle_s: float = 1.0) 
     return slopes | {"slope_height": slope(t.height_command, t.height, settled_height(t))}
 
 
-def summarize(values: torch.Tensor, seed: int = 0, resamples: int = 1000) -> dict[str, Any]:
+def summarize(
+    values: torch.Tensor, seed: int = 0, resamples: int = 1000, group: torch.Tensor | None = None
+) -> dict[str, Any]:
     """Mean, standard deviation and 95 % interval of the mean over envs, and the number of envs `n` behind them.
 
     Numbers (N,) get a bootstrap interval, NaN left out; of several in an env, (N, K), the mean is over all of them, and
     an env's stay together in the bootstrap. Events (N,) bool get Wilson's interval, which has a width even where all
     envs agree. Where nothing could be measured the numbers are null and `reason` says so.
+
+    Args:
+        values: Numbers or events of every env.
+        seed: Of the bootstrap.
+        resamples: Of the bootstrap.
+        group: (N,) int; the bootstrap draws groups, not envs, where envs of one group are alike.
     """
-    values = values.unsqueeze(1) if values.dim() == 1 else values
-    known = torch.isfinite(values)
-    counts = known.sum(1)
-    n = int((counts > 0).sum())
+    of_env = torch.arange(len(values)).repeat_interleave(values[0].numel() if len(values) else 1)
+    values, single = values.flatten(), values.dim() == 1
+    finite = torch.isfinite(values)
+    counted = values[finite].double()
+    n = counted.numel() if single else len(of_env[finite].unique())
     if n == 0:
         return {"mean": None, "std": None, "ci95": None, "n": 0, "reason": "no env had anything to measure"}
-    counted = values[known].double()
     mean, std = float(counted.mean()), float(counted.std()) if counted.numel() > 1 else 0.0
     if values.dtype == torch.bool:
         return {"mean": mean, "std": std, "ci95": list(wilson_interval(mean, n)), "n": n}
-    totals = torch.where(known, values, 0.0).sum(1)
-    draws = _resamples(n, seed, resamples)
-    means = (draws @ totals[counts > 0].float()) / (draws @ counts[counts > 0].float())
+    _, member = torch.unique((of_env if group is None else group)[finite], return_inverse=True)
+    totals, sizes = torch.bincount(member, counted).float(), torch.bincount(member).float()
+    draws = bootstrap_draws(len(sizes), seed, resamples)
+    means = (draws @ totals) / (draws @ sizes)
     low, high = torch.quantile(means.double(), torch.tensor([0.025, 0.975], dtype=torch.float64)).tolist()
     # Single precision may put the interval of equal numbers beside them by a rounding.
     return {"mean": mean, "std": std, "ci95": [min(low, mean), max(high, mean)], "n": n}
@@ -179,8 +188,8 @@ def wilson_interval(share: float, n: int) -> tuple[float, float]:
 
 
 @lru_cache(maxsize=4)
-def _resamples(n: int, seed: int, resamples: int) -> torch.Tensor:
-    """How often each of `n` envs is drawn in each bootstrap sample, (resamples, n)."""
+def bootstrap_draws(n: int, seed: int, resamples: int) -> torch.Tensor:
+    """How often each of `n` envs, or groups of them, is drawn in each bootstrap sample, (resamples, n)."""
     rng = torch.Generator().manual_seed(seed)
     draws = (torch.randint(0, n, (n,), generator=rng) for _ in range(resamples))
     return torch.stack([torch.bincount(draw, minlength=n) for draw in draws]).float()

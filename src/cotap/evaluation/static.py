@@ -152,6 +152,8 @@ class Settled:
     """(N,) bool."""
     saturated: torch.Tensor
     """(N,) bool: an arm joint was at its torque limit at the end."""
+    qpos: torch.Tensor
+    """(2, N, nq) configurations before the load and at the end."""
     film: torch.Tensor
     """Of the first env, as `Trajectory` has it."""
 
@@ -168,6 +170,7 @@ def settle(env: HumanoidEnv, policy: PolicyFunction, seconds: float, side: int) 
     obs = env.reset()
     fell = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
     averages: list[torch.Tensor] = []
+    ends: list[torch.Tensor] = []
     frames: list[torch.Tensor] = []
     steps, window = round(seconds / env.dt), round(1.0 / env.dt)
     rotation = torch.zeros(env.num_envs, 3, 3, device=env.device)
@@ -181,6 +184,7 @@ def settle(env: HumanoidEnv, policy: PolicyFunction, seconds: float, side: int) 
             if step >= steps - window:
                 total += env.record.state.arms.tip[:, side] / window
         averages.append(total)
+        ends.append(env.sim.qpos.cpu().clone())
         if begin == 0:
             s = env.state
             rotation = s.torso_to_heading
@@ -188,7 +192,9 @@ def settle(env: HumanoidEnv, policy: PolicyFunction, seconds: float, side: int) 
     moved = (rotation @ (averages[1] - averages[0]).unsqueeze(-1)).squeeze(-1)
     torque = env.record.torque[:, env.num_lower :].unflatten(1, (len(env.spec.arms), -1))[:, side]
     saturated = (torque.abs() > 0.999 * env.arm_limits[side]).any(1)
-    return Settled(moved.cpu(), condition.cpu(), fell.cpu(), saturated.cpu(), torch.stack(frames).cpu())
+    return Settled(
+        moved.cpu(), condition.cpu(), fell.cpu(), saturated.cpu(), torch.stack(ends), torch.stack(frames).cpu()
+    )
 
 
 def measure(env: HumanoidEnv, protocol: StaticStiffness, policy: PolicyFunction) -> StaticResult:

@@ -1,4 +1,4 @@
-"""How far each arm joint may turn by itself before the arm meets the rest of the robot."""
+"""Where arms meet the rest of the robot."""
 
 from __future__ import annotations
 
@@ -46,10 +46,30 @@ def clear_range(spec: RobotSpec, low: torch.Tensor, high: torch.Tensor) -> tuple
     return bounds[0], bounds[1]
 
 
+def touching(model: mujoco.MjModel, spec: RobotSpec, side: int, qpos: torch.Tensor) -> torch.Tensor:
+    """Whether (N,) an arm, by its place `side` among `spec.arms`, touches anything at configurations `qpos` (N, nq).
+
+    Shapes meet as `model` lets them: in one of `build_model(spec, "feet")` no arm touches anything.
+    """
+    of_arm = np.zeros(model.nbody, dtype=bool)
+    of_arm[[model.joint(name).bodyid[0] for name in spec.arms[side].joints]] = True
+    data, touched = mujoco.MjData(model), []
+    for configuration in qpos.double().cpu().numpy():
+        _collide(model, data, configuration)
+        ends = of_arm[model.geom_bodyid[data.contact.geom]]
+        touched.append(bool(((ends[:, 0] != ends[:, 1]) & (data.contact.dist < 0.0)).any()))
+    return torch.tensor(touched, dtype=torch.bool)
+
+
 def _nearest(model: mujoco.MjModel, data: mujoco.MjData, qpos: np.ndarray) -> float:
     """Smallest distance [m] of shapes that may meet, negative where they overlap; infinite where none are near."""
+    _collide(model, data, qpos)
+    return float(data.contact.dist.min(initial=np.inf))
+
+
+def _collide(model: mujoco.MjModel, data: mujoco.MjData, qpos: np.ndarray) -> None:
+    """Find the contacts at a configuration."""
     data.qpos[:] = qpos
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
     mujoco.mj_collision(model, data)
-    return float(data.contact.dist.min(initial=np.inf))
