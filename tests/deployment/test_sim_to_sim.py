@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from cotap.compliance.laws import LawConfig
+from cotap.compliance.laws import READS, LawConfig
 from cotap.deployment import sim_to_sim
 from cotap.deployment.controller import law_config
 from cotap.deployment.engines import EngineConfig
@@ -24,6 +24,7 @@ from cotap.deployment.sim_to_sim import (
     compare,
     falls,
     figure,
+    laws_by_part,
     loads,
     markdown,
     mean_pose,
@@ -33,9 +34,15 @@ from cotap.deployment.sim_to_sim import (
 from cotap.deployment.trial import Trial
 from cotap.deployment.workers import Workers
 from cotap.envs.upper_body import UpperBodyConfig
+from cotap.evaluate import parse
 from cotap.evaluation.disturbance import ConstantLoad, Impact
-from cotap.robots import RobotSpec
+from cotap.evaluation.law_options import parse_law
+from cotap.robots import ROBOTS, RobotSpec
 from reports import sim_to_sim as script
+from reports.paper.arms import arms as impact_arms
+from reports.paper.constant_load import ROWS as LOADS
+
+PD = {"PD": "pd"}
 
 
 def test_rates_of_falls_have_wilsons_interval():
@@ -57,7 +64,7 @@ def test_trials_that_fell_are_in_no_figure_of_the_hand(spec: RobotSpec, part: Ca
             return [stand(spec, down) for down in fell]
 
         if part is loads:
-            return loads(run, spec, protocol, Comparison(), UpperBodyConfig())["PD"]
+            return loads(run, spec, protocol, PD, Comparison(), UpperBodyConfig())["PD"]
         return periodic(run, spec, Comparison(), UpperBodyConfig())
 
     one, two, none = result(False), result(False, True), result(True)
@@ -110,10 +117,8 @@ def stand(spec: RobotSpec, falls: bool) -> Trial:
         row = {name: torch.zeros(1) for name in ("height", "height_command", "path_error")}
         row["stand"] = torch.zeros(1, dtype=torch.bool)
         row |= {name: torch.zeros(1, 3) for name in ("velocity", "command")}
-        row |= {
-            name: torch.zeros(1, joints)
-            for name in ("arm_error", "arm_velocity", "arm_torque_share", "arm_static_torque")
-        }
+        row |= {name: torch.zeros(1, joints) for name in ("arm_error", "arm_velocity", "arm_static_torque")}
+        row["torque_share"] = torch.zeros(1, len(spec.joints))
         row["arm_torque"] = torch.full((1, joints), 6.0 * math.sin(2.0 * math.pi * 0.02 * k / 4.0))
         row |= {name: torch.zeros(1, 2) for name in ("position", "foot_speed", "foot_height")}
         row |= {"foot_contact": torch.ones(1, 2, dtype=torch.bool), "fell": torch.tensor([down])}
@@ -142,7 +147,7 @@ def test_statics_is_jacobian_transpose_and_compliance(any_spec, any_model):
 
 @pytest.mark.slow
 def test_a_small_comparison_is_written_whole(shipped_file, tmp_path, monkeypatch):
-    monkeypatch.setattr(sim_to_sim, "LAWS", {"PD": "pd"})
+    monkeypatch.setattr(sim_to_sim, "laws_by_part", lambda _: {"impact": PD, "constant-load": PD})
     monkeypatch.setattr(sim_to_sim, "PERTURBATIONS", {"late": Perturbations(delay_steps=(1, 1))})
     arguments = ["--policy", str(shipped_file), "--engines", "mujoco", "--trials", "1", "--perturbed-trials", "1",
                  "--load-trials", "3", "--episode-seconds", "2", "--timestep", "0.01", "--jobs", "1", "--output",
@@ -198,10 +203,9 @@ def test_parts_are_run_as_they_ask_and_otherwise_as_the_policy_was_trained(polic
     assert result["dt"] == policy.metadata.control_dt
 
 
-def test_loads_keep_what_the_policy_was_trained_with(spec, monkeypatch):
+def test_loads_keep_what_the_policy_was_trained_with(spec):
     trained = UpperBodyConfig(LawConfig("cotap", null_stiffness=33.0, damping="pd"), LawConfig("cotap"))
     trained.torso.model, trained.singularity_ratio = "constant", False
-    monkeypatch.setattr(sim_to_sim, "LAWS", {"K 500": "cotap:stiffness=500"})
 
     class Asked(Exception):
         pass
@@ -211,7 +215,7 @@ def test_loads_keep_what_the_policy_was_trained_with(spec, monkeypatch):
         raise Asked(laws)
 
     with pytest.raises(Asked) as asked:
-        loads(run, spec, Impact(), Comparison(), trained)
+        loads(run, spec, Impact(), {"K 500": "cotap:stiffness=500"}, Comparison(), trained)
     laws = asked.value.args[0]
     assert laws.left == laws.right == LawConfig("cotap", (500.0,) * 3, 33.0, damping="pd")
     assert (laws.torso.model, laws.singularity_ratio) == ("constant", False)
@@ -232,7 +236,7 @@ def a_result() -> dict[str, Any]:
         "constant-load": {"PD": law | {"curve": []}}, "periodic-load": {"time": [0.0, 0.02], "arms": arms},
         "perturbations": {"late": fell},
     }  # fmt: skip
-    return {"dt": 0.02, "engines": {"mujoco": one}}
+    return {"dt": 0.02, "settings": {"motion": "mixture"}, "engines": {"mujoco": one}}
 
 
 def test_the_report_has_every_number_in_its_place():
@@ -240,17 +244,54 @@ def test_the_report_has_every_number_in_its_place():
     rows = [line for line in markdown(a_result()).splitlines() if line and not line.startswith("|---")]
     head = "| engine | law | fell | e_torso [m/s] | e_ee_hit [m] | j_upper [Nm] | hand z at the end [m] |"
     assert rows == [
-        "## Velocity tracking", "| measure | mujoco |", "| trials that fell | 2 of 20 (3 to 30 %) |",
+        "## Velocity tracking, arms moving (mixture)", "| measure | mujoco |",
+        "| trials that fell | 2 of 20 (3 to 30 %) |",
         f"| e_lin | {shown} |",
-        "## Impact of 500 N for 0.05 s, left hand, stance", head,
+        "## Impact of 500 N for 0.05 s, left hand, stance, arms moving (mixture)", head,
         f"| mujoco | PD | 2 of 20 (3 to 30 %) | {shown} | - | {shown} | - |",
-        "## Constant load of -50 N, left hand, stance", head,
+        "## Constant load of -50 N, left hand, stance, arms held", head,
         f"| mujoco | PD | 2 of 20 (3 to 30 %) | {shown} | - | {shown} | - |",
-        "## Periodic load of 30 N, 4 s, both hands: left alpha 0.7 at 500 N/m, right PD",
+        "## Periodic load of 30 N, 4 s, both hands, arms held: left alpha 0.7 at 500 N/m, right PD",
         "| engine | arm | elbow torque [Nm] | of it statics | hand swing [m] | of it statics |",
         "| mujoco | left | 6.000 | 5.000 | 0.050 | - |", "| mujoco | right | - | - | - | - |",
-        "## Perturbations", "| what is wrong, fell | mujoco |", "| late | 2 of 20 (3 to 30 %) |",
+        "## Perturbations, arms moving (mixture)", "| what is wrong, fell | mujoco |", "| late | 2 of 20 (3 to 30 %) |",
     ]  # fmt: skip
+
+
+def test_the_report_says_that_arms_are_held():
+    held = markdown(a_result() | {"settings": {"motion": "none"}})
+    assert held.count("arms held") == held.count("## ") == 5
+
+
+@pytest.mark.parametrize("robot", ["h1", "g1"])
+def test_laws_are_those_of_the_tables_of_the_evaluation(robot):
+    """As `cotap evaluate` reads the options of the paper's tables, for a policy trained in another way."""
+    trained = LawConfig("cotap", (80.0,) * 3, 33.0, 0.4, damping="pd", error="task")
+    tables = {"impact": impact_arms(robot), "constant-load": LOADS}
+    for part, laws in laws_by_part(ROBOTS[robot]()).items():
+        for label, text in laws.items():
+            asked = parse(["impact", *tables[part][label]]).laws.configure(UpperBodyConfig(trained, trained)).left
+            found = parse_law("left", text, trained)
+            assert found.name == asked.name
+            for field in READS[found.name]:
+                assert getattr(found, field) == getattr(asked, field), (label, field)
+
+
+def test_arms_move_but_under_loads_that_last(policy):
+    counts = {"velocity-tracking": 3, "impact": 5, "constant-load": 5, "periodic-load": 5, "perturbations": 4}
+
+    class Asked(Exception):
+        pass
+
+    def run(scenario, count, *_, **__):
+        raise Asked(scenario.arms.clip, count)
+
+    for motion, clip in (("mixture", "mixture"), ("punch", "punch"), ("none", "")):
+        cfg = Comparison(motion=motion, trials=3, perturbed_trials=4, load_trials=5)
+        for part, count in counts.items():
+            with pytest.raises(Asked) as asked:
+                sim_to_sim._parts(policy, cfg, run)[part]()
+            assert asked.value.args == ("" if part.endswith("-load") else clip, count), part
 
 
 def test_the_figure_draws_errors_from_the_onset_on_and_torques_about_statics(tmp_path, monkeypatch):

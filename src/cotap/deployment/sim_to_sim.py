@@ -1,6 +1,7 @@
 """One policy in several engines: velocity tracking, impact, constant and periodic load, and what robots do wrong.
 
-The paper's section IV-C, with predictions beside what was measured where statics makes them.
+The paper's section IV-C, with predictions beside what was measured where statics makes them. Laws and what arms do are
+those of the evaluation's tables.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from cotap.deployment.engines import EngineConfig, EngineState, make_engine
 from cotap.deployment.policy import OnnxPolicy
 from cotap.deployment.robot import Perturbations
 from cotap.deployment.safety import SafetyConfig
-from cotap.deployment.scenario import Scenario, TimedCommand
+from cotap.deployment.scenario import ArmMotion, Scenario, TimedCommand
 from cotap.deployment.trial import Trial, trajectory
 from cotap.deployment.workers import Workers
 from cotap.envs import HumanoidEnvConfig
@@ -38,6 +39,7 @@ from cotap.evaluation.periodic import amplitude as swing_amplitude
 from cotap.evaluation.periodic import elbow_joints
 from cotap.evaluation.report import pyplot
 from cotap.motions.elbow import elbow_index
+from cotap.motions.reference import HELD, MIXTURE
 from cotap.robots import RobotSpec
 
 STAND = (TimedCommand(stand=True),)
@@ -57,11 +59,11 @@ APART = Perturbations(start_error=0.02)
 """Of robots under one load, which would else all do the same."""
 SWINGS = ("elbow_torque_nm", "elbow_torque_statics_nm", "hand_swing_m", "hand_swing_statics_m")
 """Amplitudes under the periodic load, and what statics makes of them; null where no trial stood."""
-LAWS = {
-    "PD": "pd", "soft PD": "soft-pd", "K 100": "cotap:stiffness=100", "K 500": "cotap:stiffness=500",
-    "K 800": "cotap:stiffness=800", "alpha 0.7, K 500": "cotap:stiffness=500,alpha=0.7",
-}  # fmt: skip
-"""Laws that impact and constant load compare."""
+HELD_ARMS = "arms held"
+SOFT_SHARE = 0.3
+"""Gain of the paper's soft PD over the largest of its PD's."""
+NULL = "null_stiffness=25"
+"""The paper's in its evaluation [Nm/rad]."""
 
 
 @dataclass
@@ -74,8 +76,11 @@ class Comparison:
     """Trials of velocity tracking."""
     perturbed_trials: int = 100
     """Trials of each perturbation."""
-    load_trials: int = 4
+    load_trials: int = 100
     """Trials of each law under each load."""
+    motion: str = MIXTURE
+    """Clip for the arms, `mixture` or `none`. mixture: as in recipes. none: hold the default pose. Under loads that
+    last, arms hold it anyhow."""
     episode_seconds: float = 20.0
     """Length of a trial of velocity tracking or under perturbations [s]."""
     seed: int = 0
@@ -92,6 +97,11 @@ class Comparison:
             raise ValueError("engines must name at least one engine")
         for name in self.engines:
             self.engine(name).check()
+
+    @property
+    def arms(self) -> ArmMotion:
+        """What arms do, but under loads that last."""
+        return ArmMotion(clip="" if self.motion == HELD else self.motion)
 
     def engine(self, name: str) -> EngineConfig:
         """The engine of that name."""
@@ -136,14 +146,14 @@ def _parts(policy: OnnxPolicy, cfg: Comparison, run: Run) -> dict[str, Callable[
     spec, trained = robot_of(policy.metadata), law_config(policy.metadata)
     impact, load = Impact(onset=ONSET_S, episode_seconds=ONSET_S + 2.0), ConstantLoad(onset=ONSET_S)
     load.episode_seconds = ONSET_S + 4.0
+    walk, laws = Scenario(cfg.episode_seconds, cfg.arms), laws_by_part(spec)
     return {
-        "velocity-tracking": lambda: tracking(run(Scenario(cfg.episode_seconds), cfg.trials), policy, cfg),
-        "impact": lambda: loads(run, spec, impact, cfg, trained),
-        "constant-load": lambda: loads(run, spec, load, cfg, trained),
+        "velocity-tracking": lambda: tracking(run(walk, cfg.trials), policy, cfg),
+        "impact": lambda: loads(run, spec, impact, laws["impact"], cfg, trained),
+        "constant-load": lambda: loads(run, spec, load, laws["constant-load"], cfg, trained),
         "periodic-load": lambda: periodic(run, spec, cfg, trained),
         "perturbations": lambda: {
-            label: falls(run(Scenario(cfg.episode_seconds), cfg.perturbed_trials, wrong=wrong))
-            for label, wrong in PERTURBATIONS.items()
+            label: falls(run(walk, cfg.perturbed_trials, wrong=wrong)) for label, wrong in PERTURBATIONS.items()
         },
     }
 
@@ -176,12 +186,29 @@ def tracking(trials: list[Trial], policy: OnnxPolicy, cfg: Comparison) -> dict[s
     return falls(trials) | {"metrics": {name: summarize(measures[name], cfg.seed) for name in names}}
 
 
-def loads(run: Run, spec: RobotSpec, protocol: Impact, cfg: Comparison, trained: UpperBodyConfig) -> dict[str, Any]:
+def laws_by_part(spec: RobotSpec) -> dict[str, dict[str, str]]:
+    """Laws that impact and constant load compare, by name: those of the paper's Table III and Fig. 4."""
+    soft = SOFT_SHARE * max(joint.kp for joint in spec.joints if joint.name in spec.upper_joints)
+    struck = {f"K {k}": f"cotap:stiffness={k}x{k}x300,{NULL}" for k in (100, 500, 800)}
+    loaded = {f"K_z {k}": f"cotap:stiffness=300x300x{k},{NULL}" for k in (100, 500, 1000)}
+    return {
+        "impact": {
+            "PD": "pd", "soft PD": f"soft-pd:soft_gain={soft:g}", **struck,
+            "alpha 0.7, K 100": f"{struck['K 100']},alpha=0.7",
+        },
+        "constant-load": {"PD": "pd", **loaded, "alpha 0.5": f"{loaded['K_z 100']},alpha=0.5"},
+    }  # fmt: skip
+
+
+def loads(
+    run: Run, spec: RobotSpec, protocol: Impact, laws: dict[str, str], cfg: Comparison, trained: UpperBodyConfig
+) -> dict[str, Any]:
     """An impact or a held load on the left hand, standing, law by law; all else of the arms is as `trained`."""
     out: dict[str, Any] = {}
     force = ForceProfile(protocol.force, protocol.hand, protocol.onset, protocol.duration)
-    scenario = Scenario(protocol.seconds, command=STAND, force=(force,))
-    for label, text in LAWS.items():
+    arms = cfg.arms if protocol.arms == "moving" else ArmMotion()
+    scenario = Scenario(protocol.seconds, arms, command=STAND, force=(force,))
+    for label, text in laws.items():
         law = parse_law("left", text, trained.left)
         trials = run(scenario, cfg.load_trials, replace(trained, left=law, right=replace(law)), APART)
         t = _trajectory(trials, protocol.seconds)
@@ -269,14 +296,22 @@ def _trajectory(trials: list[Trial], seconds: float) -> Any:
 
 def markdown(result: dict[str, Any]) -> str:
     """The report."""
-    engines = result["engines"]
-    lines = ["## Velocity tracking", "", "| measure | " + " | ".join(engines) + " |", "|---" * (len(engines) + 1) + "|"]
+    engines, motion = result["engines"], result["settings"]["motion"]
+    moving = HELD_ARMS if motion == HELD else f"arms moving ({motion})"
+    lines = [
+        f"## Velocity tracking, {moving}",
+        "",
+        "| measure | " + " | ".join(engines) + " |",
+        "|---" * (len(engines) + 1) + "|",
+    ]
     lines.append("| trials that fell | " + " | ".join(_falls(e["velocity-tracking"]) for e in engines.values()) + " |")
     for name in next(iter(engines.values()))["velocity-tracking"]["metrics"]:
         row = [_mean(e["velocity-tracking"]["metrics"][name]) for e in engines.values()]
         lines.append(f"| {name} | " + " | ".join(row) + " |")
-    for part, title in (("impact", "Impact of 500 N for 0.05 s"), ("constant-load", "Constant load of -50 N")):
-        lines += ["", f"## {title}, left hand, stance", ""]
+    for part, title, arms in (
+        ("impact", "Impact of 500 N for 0.05 s", moving), ("constant-load", "Constant load of -50 N", HELD_ARMS),
+    ):  # fmt: skip
+        lines += ["", f"## {title}, left hand, stance, {arms}", ""]
         lines += ["| engine | law | fell | e_torso [m/s] | e_ee_hit [m] | j_upper [Nm] | hand z at the end [m] |",
                   "|---|---|---|---|---|---|---|"]  # fmt: skip
         for name, e in engines.items():
@@ -284,7 +319,7 @@ def markdown(result: dict[str, Any]) -> str:
                 m = row["metrics"]
                 shown = " | ".join(_mean(m[k]) for k in ("e_torso", "e_ee_hit", "j_upper"))
                 lines.append(f"| {name} | {label} | {_falls(row)} | {shown} | {_mean(row['displacement_z'])} |")
-    lines += ["", "## Periodic load of 30 N, 4 s, both hands: left alpha 0.7 at 500 N/m, right PD", ""]
+    lines += ["", f"## Periodic load of 30 N, 4 s, both hands, {HELD_ARMS}: left alpha 0.7 at 500 N/m, right PD", ""]
     lines += [
         "| engine | arm | elbow torque [Nm] | of it statics | hand swing [m] | of it statics |",
         "|---|---|---|---|---|---|",
@@ -293,7 +328,7 @@ def markdown(result: dict[str, Any]) -> str:
         for side, arm in e["periodic-load"]["arms"].items():
             cells = ("-" if arm[key] is None else f"{arm[key]:.3f}" for key in SWINGS)
             lines.append(f"| {name} | {side} | " + " | ".join(cells) + " |")
-    lines += ["", "## Perturbations", "", "| what is wrong, fell | " + " | ".join(engines) + " |"]
+    lines += ["", f"## Perturbations, {moving}", "", "| what is wrong, fell | " + " | ".join(engines) + " |"]
     lines.append("|---" * (len(engines) + 1) + "|")
     for label in next(iter(engines.values()))["perturbations"]:
         lines.append(f"| {label} | " + " | ".join(_falls(e["perturbations"][label]) for e in engines.values()) + " |")
