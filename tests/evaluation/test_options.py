@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, fields, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -186,6 +186,20 @@ def distilled(tmp_path, save) -> Path:
     path = save(tmp_path / "p.pt", HumanoidEnvConfig(num_envs=1, num_threads=1, upper_body=law))
     save_checkpoint(path, load_checkpoint(path) | {"kind": "distill"})
     return path
+
+
+def test_another_law_keeps_what_the_policy_was_trained_with():
+    """The paper's damping and the hand's error stay under CoTaP + FACET, and stiffness under FACET alone."""
+    law = LawConfig("cotap", (500.0, 500.0, 300.0), 25.0, 0.7, error="task", damping="pd")
+    trained = UpperBodyConfig(law, law)
+    for name in ("cotap+facet", "facet"):
+        arms = LawOptions(method=name).configure(trained)
+        assert arms.left == arms.right == replace(law, name=name)
+    assert LawOptions(left="cotap+facet", right="pd").configure(trained).left == replace(law, name="cotap+facet")
+    told = LawOptions(method="cotap+facet", error="joint", stiffness=(200.0,)).configure(trained)
+    assert told.left == replace(law, name="cotap+facet", error="joint", stiffness=(200.0,) * 3)
+    # A policy that was trained under PD has nothing to keep.
+    assert LawOptions(method="cotap+facet").configure(UpperBodyConfig()).left == LawConfig("cotap+facet")
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)

@@ -17,8 +17,8 @@ OF_ALL_ARMS = {"torso_compliance": "stiffness", "singularity_ratio": "condition_
 
 @dataclass
 class LawOptions:
-    """Laws of the arms. What is not given is as the policy was trained, or for another law as the law has it. A
-    policy that was trained under PD has the protocol's own law, if it has one. A policy that sets alpha and stiffness
+    """Laws of the arms. What is not given is as the policy was trained, under another law too. A policy that was
+    trained under PD has the protocol's own law, if it has one. A policy that sets alpha and stiffness
     itself no longer does once a method, a law, alpha or stiffness is given."""
 
     method: str | None = None
@@ -108,7 +108,7 @@ class LawOptions:
         given = {f.name: getattr(self, f.name) for f in fields(LawConfig) if f.name in self.given()}
         if self.stiffness is not None:
             given["stiffness"] = _three(self.stiffness)
-        law = replace(trained if name == trained.name else LawConfig(name), **given)
+        law = replace(trained, name=name, **given)
         return parse_law(side, text, law) if text else _without_unread_store(law)
 
 
