@@ -75,8 +75,8 @@ def test_the_report_by_hand():
     result = m.report(5.0, 2.5, 0)
     means = {name: value["mean"] for name, value in result["metrics"].items()}
     assert means == pytest.approx({
-        "survival_s": 27.5 / 3, "completed_fraction": 2 / 3, "position_error": 1.4 / 5, "yaw_error": 0.8 / 5, "energy": 200.0,
-        "vibration": 1.5,
+        "survival_s": 27.5 / 3, "completed_fraction": 2 / 3, "position_error": 1.4 / 5, "yaw_error": 0.8 / 5,
+        "energy": 200.0, "vibration": 1.5,
     })  # fmt: skip
     assert result["metrics"]["completed_fraction"]["ci95"] == pytest.approx([0.2077, 0.9385], abs=1e-4)  # Wilson's
     assert result["num_falls"] == 1
