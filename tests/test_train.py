@@ -20,8 +20,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from cotap import __version__, pipeline, train
 from cotap.agents.checkpoint import load_checkpoint, save_checkpoint, sha256
 from cotap.agents.runner import sole_writer
-from cotap.configs import BASE_RECIPES, DISTILL_RECIPES, BaseTraining, from_plain
-from cotap.envs import HumanoidEnv
+from cotap.configs import BASE_RECIPES, DISTILL_RECIPES, BaseTraining, from_plain, to_plain
+from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.rewards import LowerRewards, UpperRewards
 from cotap.evaluation import policy
 from cotap.pipeline import PipelineOptions
@@ -651,8 +651,23 @@ def test_a_base_that_is_not_shipped_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.setattr(policy, "checkpoint_path", lambda name: tmp_path / f"{name}.pt")
-    assert run("distill", RUN_DIR, tmp_path / "run") == 2
-    assert "checkpoint 'h1-base' is not shipped" in capsys.readouterr().err
+    for robot, options in (("h1", []), ("g1", ["--robot", "g1"])):
+        assert run("distill", RUN_DIR, tmp_path / "run", *options) == 2
+        assert f"no base policy of robot '{robot}' is shipped; shipped are: none" in capsys.readouterr().err
+
+
+def test_a_distillation_takes_the_shipped_base_of_a_robot(checkpoint: Path, tmp_path: Path, monkeypatch: Any):
+    path = shipped(tmp_path, load_checkpoint(checkpoint), "g1-base.pt")
+    monkeypatch.setattr(policy, "checkpoint_path", lambda name: tmp_path / f"{name}.pt")
+    monkeypatch.setattr(train, "_base_config", lambda _: BaseTraining(env=HumanoidEnvConfig(robot="g1")))
+    options = train._parse_distill(["--robot", "g1"])
+    assert (options.base_checkpoint, options.training.env.robot) == (str(path), "g1")
+
+
+def test_a_base_of_another_robot_is_refused_by_name(checkpoint: Path, capsys: pytest.CaptureFixture[str]):
+    assert run("distill", BASE_CHECKPOINT, checkpoint, "--robot=g1") == 2
+    said = f"checkpoint '{checkpoint}' is of robot 'h1', not of 'g1' (--robot)"
+    assert said in capsys.readouterr().err.replace("\n", " ")
 
 
 def test_going_on_from_a_checkpoint_of_no_run_begins_a_run_of_its_own(

@@ -67,8 +67,10 @@ class Options(Generic[P]):
 
     protocol: tyro.conf.OmitArgPrefixes[P]
     laws: tyro.conf.OmitArgPrefixes[LawOptions]
-    checkpoint: str = "h1-cotap"
-    """Policy to evaluate: a file, or a shipped policy's name."""
+    checkpoint: str = ""
+    """Policy to evaluate: a file, or a shipped policy's name. By default what ships of --robot."""
+    robot: str = ""
+    """Name of the robot whose shipped policy is evaluated, the one under compliance if there is one; by default h1."""
     backend: str = "auto"
     """What simulates: mujoco, mjbatch (both on the CPU), warp (a GPU) or auto. auto takes warp if there is a GPU and
     the extra `warp` is installed, else mjbatch if that is installed, else mujoco. Results are reproducible on one
@@ -145,7 +147,7 @@ def prepare(options: Options[Protocol]) -> tuple[HumanoidEnv, Policy, str]:
 
     from cotap.agents.checkpoint import sha256
     from cotap.envs import HumanoidEnv
-    from cotap.evaluation.policy import find_checkpoint, load_policy, require_acting
+    from cotap.evaluation.policy import find_policy, load_policy, require_acting
     from cotap.sim import resolve_backend
 
     protocol = options.protocol
@@ -155,7 +157,7 @@ def prepare(options: Options[Protocol]) -> tuple[HumanoidEnv, Policy, str]:
     require_outputs(options.json, options.plot, options.video)
     if options.threads:
         torch.set_num_threads(options.threads)
-    path = find_checkpoint(options.checkpoint)
+    path = find_policy(options.checkpoint, options.robot)
     policy = load_policy(path)
     torch.manual_seed(protocol.seed)
     cfg = policy.env_config
@@ -212,9 +214,9 @@ def _measured(options: Options[Protocol], env: HumanoidEnv, policy: Policy) -> d
     """What the protocol finds, in the engine that it names if it names one."""
     if isinstance(options.protocol, Tour) and options.protocol.engine != "mujoco":
         from cotap.deployment.tour import evaluate_in_engine
-        from cotap.evaluation.policy import find_checkpoint
+        from cotap.evaluation.policy import find_policy
 
-        return evaluate_in_engine(options.protocol, find_checkpoint(options.checkpoint), env.cfg)
+        return evaluate_in_engine(options.protocol, find_policy(options.checkpoint, options.robot), env.cfg)
     return options.protocol.evaluate(env, policy)
 
 

@@ -19,8 +19,10 @@ class ExportOptions:
 
     output: str
     """File to write (.onnx)."""
-    checkpoint: str = "h1-cotap"
-    """Policy to export: a file, or a shipped policy's name."""
+    checkpoint: str = ""
+    """Policy to export: a file, or a shipped policy's name. By default what ships of --robot."""
+    robot: str = ""
+    """Name of the robot whose shipped policy is exported, the one under compliance if there is one; by default h1."""
     checks: int = 1000
     """Observations on which to compare file and torch. The file is kept only if they agree."""
     seed: int = 0
@@ -33,7 +35,7 @@ def main(argv: list[str] | None = None) -> int:
     options = tyro.cli(ExportOptions, args=argv, prog="cotap export")
     try:
         from cotap.deployment.graph import export_policy
-        from cotap.evaluation.policy import find_checkpoint
+        from cotap.evaluation.policy import find_policy
 
         require_range("checks", require_positive_int("checks", options.checks), 1, 1_000_000)
         require_seed("seed", options.seed)
@@ -41,7 +43,8 @@ def main(argv: list[str] | None = None) -> int:
         if output.suffix != ".onnx":
             raise ValueError(f"--output must end in .onnx, got {options.output!r}")
         require_output("--output", options.output)
-        summary, worst = export_policy(find_checkpoint(options.checkpoint), output, options.checks, options.seed)
+        path = find_policy(options.checkpoint, options.robot)
+        summary, worst = export_policy(path, output, options.checks, options.seed)
     except (ValueError, OSError, ModuleNotFoundError) as error:
         print(f"error: {shortened(str(error))}", file=sys.stderr)
         return 2

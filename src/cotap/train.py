@@ -67,7 +67,8 @@ class BaseOptions:
 class DistillOptions:
     """Stage 2: arms under compliance, a policy that begins as the base and is guided by it while it learns.
 
-    `--num-envs`, `--iterations` and `--backend` are short for `--env.num-envs`, `--runner.iterations`, `--env.backend`;
+    `--robot` names the robot whose shipped base policy is taken; any other base brings its robot. `--num-envs`,
+    `--iterations` and `--backend` are short for `--env.num-envs`, `--runner.iterations` and `--env.backend`;
     `--modulation` for `--env.upper-body.modulation.kind`.
     """
 
@@ -78,7 +79,7 @@ class DistillOptions:
     run is the default for every option."""
     base_checkpoint: str = ""
     """Policy to start from, a base or a distilled one: a file, or a shipped policy's name. It guides the new policy as
-    well. By default the shipped base policy."""
+    well. By default the base that ships of --robot."""
     recipe: str = "default"
     """default, quick, paper, short, facet, modulated, no-ratio, torque-critic or goals. default: 80 to 1200 N/m. quick
     and short: the same, 15 M and 40 M samples. paper: 150 to 450 N/m. facet: arms under PD, FACET's tracking reward.
@@ -172,11 +173,12 @@ def _parse_base(args: list[str]) -> BaseOptions:
 
 def _parse_distill(args: list[str]) -> DistillOptions:
     """Options on top of the resumed checkpoint's config, or else of what the recipe makes of the base's."""
-    from cotap.evaluation.policy import shipped_checkpoint
+    from cotap.evaluation.policy import require_robot, shipped_policy
 
     goes_on = _resumes_newest(args)  # with whatever the run began with
     args = _expand(args)
     given, resumed, base = (_peek(args, option) for option in ("--recipe", "--resume", "--base-checkpoint"))
+    robot = _peek(args, SHORTCUTS["--robot"])
     recipe = require_one_of("recipe", given or "default", DISTILL_RECIPES.keys())
     if resumed:
         training = _resumed_config(resumed, "" if goes_on else given, "distill", DistillTraining)
@@ -184,8 +186,10 @@ def _parse_distill(args: list[str]) -> DistillOptions:
             raise ValueError(f"--base-checkpoint {base!r}: checkpoint {resumed!r} brings the base that guides it")
         base = ""
     else:
-        base = base or str(shipped_checkpoint("h1-base"))
+        base = base or str(shipped_policy(robot or BaseTraining().env.robot, ("base",)))
         training = DISTILL_RECIPES[recipe](_base_config(base))
+    if robot:
+        require_robot(resumed or base, training.env.robot, robot)
     _unpin_library(args, training)
     samples = training.samples
     default = DistillOptions(recipe=recipe, base_checkpoint=base, training=training)

@@ -218,6 +218,7 @@ def test_a_file_that_differs_from_torch_is_not_kept(random_checkpoint, random_po
         (["--output", "p.pt"], "must end in .onnx"),
         (["--output", "nowhere/p.onnx"], "folder does not exist"),
         (["--output", "p.onnx", "--checkpoint", "missing.pt"], "'missing.pt' does not exist"),
+        (["--output", "p.onnx", "--robot", "h2"], "robot 'h2' is unknown"),
         (["--output", "p.onnx", "--checks", "0"], "checks must be a positive integer"),
     ],
 )

@@ -71,6 +71,8 @@ def test_loaded_policy_is_deterministic_and_reads_what_it_was_trained_on(checkpo
         ([*SMALL, "--method", "magic"], "pd"),
         ([*SMALL, "--speed-x", "nan"], "speed_x"),
         ([*SMALL, "--checkpoint", "nowhere.pt"], "nowhere.pt"),
+        ([*SMALL, "--robot", "h2"], "robot 'h2' is unknown; known: g1, h1"),
+        ([*SMALL, "--checkpoint", "h1-base", "--robot", "g1"], "'h1-base' is of robot 'h1', not of 'g1' (--robot)"),
         ([*SMALL, "--json", "no/such/folder/x.json"], "no/such/folder"),
         ([*SMALL, "--torque-limit-scale", "-1"], "torque_limit_scale"),
         ([*SMALL, "--collision", "arms"], "collision 'arms'"),

@@ -23,6 +23,7 @@ from cotap.checks import quoted, reason_of, require_one_of, require_positive_int
 from cotap.configs import from_plain
 from cotap.configs.saved import without_unknown_terms
 from cotap.envs import HumanoidEnvConfig
+from cotap.robots import ROBOTS
 
 CHECKPOINTS = ("h1-base", "h1-cotap", "g1-base", "g1-cotap")
 """Names under which policies are shipped: robot and stage."""
@@ -45,6 +46,39 @@ def shipped_checkpoint(name: str = "h1-base") -> Path:
     if not path.is_file():
         raise ValueError(f"checkpoint {name!r} is not shipped; shipped are: {', '.join(shipped_names())}")
     return path
+
+
+def shipped_policy(robot: str, stages: tuple[str, ...] = ("cotap", "base")) -> Path:
+    """Path of what ships of a robot, of the first of `stages` of which there is something. Raises ValueError for an
+    unknown robot, and where there is nothing."""
+    require_one_of("robot", robot, ROBOTS)
+    shipped = shipped_names()
+    for name in (f"{robot}-{stage}" for stage in stages):
+        if name in shipped:
+            return shipped_checkpoint(name)
+    wanted = "base policy" if stages == ("base",) else "policy"
+    raise ValueError(f"no {wanted} of robot {robot!r} is shipped; shipped are: {', '.join(shipped) or 'none'}")
+
+
+def find_policy(checkpoint: str, robot: str) -> Path:
+    """The file of a policy: as `find_checkpoint` of `checkpoint`, or, if that is empty, what ships of `robot`, which by
+    default is that of an environment.
+
+    Raises:
+        ValueError: there is none, or `checkpoint` is of another robot than `robot`.
+    """
+    if not checkpoint:
+        return shipped_policy(robot or HumanoidEnvConfig.robot)
+    path = find_checkpoint(checkpoint)
+    if robot:
+        require_robot(checkpoint, load_policy(path).env_config.robot, robot)
+    return path
+
+
+def require_robot(checkpoint: str, own: str, robot: str) -> None:
+    """Raise ValueError unless a checkpoint's `own` robot is the one that was asked for."""
+    if own != robot:
+        raise ValueError(f"checkpoint {checkpoint!r} is of robot {own!r}, not of {robot!r} (--robot)")
 
 
 def find_checkpoint(given: str) -> Path:
