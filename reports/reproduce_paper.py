@@ -23,6 +23,8 @@ from reports.paper.impact import impact
 from reports.paper.observation import observation
 from reports.paper.periodic import periodic
 from reports.paper.pictures import pictures
+from reports.paper.tables import PAPER_ROBOT
+from reports.paper.tour import tour
 from reports.paper.walking import walking
 
 PARTS: dict[str, Callable[[Book], None]] = {
@@ -35,6 +37,7 @@ PARTS: dict[str, Callable[[Book], None]] = {
     "walking": walking,
     "field": field,
     "beyond": beyond,
+    "tour": tour,
     "pictures": pictures,
 }
 HEAD = """Written by `{command}`: do not edit. {envs} envs a row unless said otherwise. Means are over the envs that
@@ -58,7 +61,7 @@ ELSEWHERE = (
 def main(argv: Sequence[str] | None = None) -> int:
     """Parse, measure, write the page. Returns the exit status; bad input ends the program with 2."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--robot", default="h1", choices=tuple(ROBOTS), help="whose policies are measured")
+    parser.add_argument("--robot", default=PAPER_ROBOT, choices=tuple(ROBOTS), help="whose policies are measured")
     parser.add_argument("--quick", action="store_true", help="128 envs a row, a short punch tour")
     parser.add_argument("--num-envs", type=int, default=0, help="envs a row; 4096, or 128 with --quick")
     parser.add_argument("--threads", type=int, default=0, help="0 takes every CPU")
@@ -126,7 +129,7 @@ def given_policies(texts: Sequence[str]) -> dict[str, str]:
 def begin(book: Book, arguments: Sequence[str]) -> None:
     """The head of the page, with the command that made it."""
     title = "The paper's tables and figures, measured here"
-    book.add(f"# {title}" if book.robot == "h1" else f"# {title}, on {book.robot.upper()}")
+    book.add(f"# {title}" if book.robot == PAPER_ROBOT else f"# {title}, on {book.robot.upper()}")
     book.paragraph(HEAD, command=shlex.join(["python", "-m", "reports.reproduce_paper", *arguments]), envs=book.envs)
     book.paragraph(IMPACT, robot=book.robot.upper())
     measured = (f"`{name}` ({samples(book, name)} M samples)" for name in book.policies if book.has(name))

@@ -7,16 +7,18 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from reports.paper.tables import PAPER_ROBOT
+
 POLICIES = ("cotap", "base", "no-ratio", "torque-critic", "goals", "facet", "seed-0", "seed-1", "seed-2")
 """Names of all policies that a page may measure: two that ship, ablations, and CoTaP trained with three seeds."""
-PAIRED = ("impact", "constant-load")
+PAIRED = ("impact", "constant-load", "periodic-load", "tour")
 """Protocols that write every env's figures, so that two evaluations are compared env by env."""
 KEPT = (
     "protocol", "method", "num_envs", "num_falls", "window", "fidelity", "num_wrong_way", "num_unholdable",
     "error_quantiles", "coverage", "impulse_50", "fall_curve", "falls",
 )  # fmt: skip
 """What results.json keeps of an evaluation, beside the measures that the page shows."""
-WITHOUT_FALLS = (*PAIRED, "periodic-load")
+WITHOUT_FALLS = ("impact", "constant-load", "periodic-load")
 """Protocols whose measures the page shows of the envs that stood."""
 
 
@@ -47,7 +49,7 @@ class Book:
     @property
     def page(self) -> Path:
         """The file of the page."""
-        return self.folder / ("results.md" if self.robot == "h1" else f"results_{self.robot}.md")
+        return self.folder / ("results.md" if self.robot == PAPER_ROBOT else f"results_{self.robot}.md")
 
     @property
     def assets(self) -> Path:
@@ -57,7 +59,7 @@ class Book:
     @property
     def paper(self) -> str:
         """Head of columns with what the paper measured."""
-        return "paper" if self.robot == "h1" else "paper (H1)"
+        return "paper" if self.robot == PAPER_ROBOT else f"paper ({PAPER_ROBOT.upper()})"
 
     def has(self, policy: str) -> bool:
         """Whether there is a checkpoint of this policy."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from reports.paper.arms import CALM, COMPLIANT, PD, SOFT, arms, label, mass
 from reports.paper.book import Book, slug
 from reports.paper.relative import keep_changes
-from reports.paper.tables import IMPACT, ORDERINGS
+from reports.paper.tables import IMPACT, ORDERINGS, PAPER_ROBOT
 from reports.paper.words import (
     ALL_THREE,
     DIGITS,
@@ -58,7 +58,7 @@ def impact(book: Book) -> None:
     compare_with_pd(book)
     orderings(book)
     without_limits(book)
-    if book.robot != "h1":
+    if book.robot != PAPER_ROBOT:
         by_mass(book)
 
 
@@ -129,7 +129,7 @@ def stance(book: Book) -> None:
 
 def walking(book: Book) -> None:
     """Where ours differs in walking."""
-    k100, impulse, weight = key("walking", "K 100"), FORCE_N * DURATION_S, mass("h1")
+    k100, impulse, weight = key("walking", "K 100"), FORCE_N * DURATION_S, mass(PAPER_ROBOT)
     book.paragraph(
         WALKING,
         paper=the_paper(book),
@@ -184,7 +184,7 @@ def without_limits(book: Book) -> None:
 
 def by_mass(book: Book) -> None:
     """The impact of an impulse that is to this robot's mass as the paper's is to H1's."""
-    force = FORCE_N * mass(book.robot) / mass("h1")
+    force = FORCE_N * mass(book.robot) / mass(PAPER_ROBOT)
     book.add("", "### Impulse by mass")
     few_columns(book, "by-mass", MODES, (PD, *COMPLIANT), ["--force", f"{force:.1f}", "0", "0"])
     book.paragraph(BY_MASS, impulse=round(force * DURATION_S, 1))

@@ -1,7 +1,9 @@
-"""What the paper printed (arXiv 2509.25443), for comparison. All of it was measured on H1."""
+"""What the paper printed (arXiv 2509.25443), for comparison."""
 
 from __future__ import annotations
 
+PAPER_ROBOT = "h1"
+"""What it measured all of this on."""
 IMPACT = {
     "stance": {
         "PD": (0.701, 0.092, 49.723), "soft PD": (0.670, 0.110, 43.627), "K 100": (0.861, 0.101, 46.664),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from reports.paper.book import Book
+from reports.paper.tables import PAPER_ROBOT
 
 NOT_MEASURED = "(not measured)"
 LABELS = {
@@ -35,9 +36,14 @@ def number(m: dict[str, Any] | None, digits: int = 3) -> str:
 
 def hundredfold(m: dict[str, Any] | None, digits: int = 1) -> str:
     """A share in percent, or a length in centimetres, with its interval."""
+    return scaled(m, 100.0, digits)
+
+
+def scaled(m: dict[str, Any] | None, factor: float, digits: int = 1) -> str:
+    """A measure in a unit of which `factor` make one of its own, as mean and interval."""
     if m is None or m["mean"] is None:
         return number(m)
-    return number({"mean": 100.0 * m["mean"], "ci95": [100.0 * bound for bound in m["ci95"]]}, digits)
+    return number({"mean": factor * m["mean"], "ci95": [factor * bound for bound in m["ci95"]]}, digits)
 
 
 def fallen(result: dict[str, Any]) -> str:
@@ -60,7 +66,7 @@ def printed(numbers: tuple[float, ...] | None) -> str:
 
 def the_paper(book: Book) -> str:
     """How a sentence begins that says what the paper measured."""
-    return "The paper" if book.robot == "h1" else "The paper, whose robot is H1,"
+    return "The paper" if book.robot == PAPER_ROBOT else f"The paper, whose robot is {PAPER_ROBOT.upper()},"
 
 
 def of(book: Book, name: str, measure: str, digits: int = 3) -> str:

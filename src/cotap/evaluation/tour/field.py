@@ -19,6 +19,11 @@ class Row(NamedTuple):
     yaw_error_deg: tuple[int, int]
     energy_kj: tuple[float | None, float | None] = (None, None)
 
+    def cells(self) -> list[str]:
+        """The name, and a cell for each of `COLUMNS`."""
+        policy, *pairs = self
+        return [policy, *("" if pair == (None, None) else " / ".join(map(_shown, pair)) for pair in pairs)]
+
 
 ROBOT = "g1"
 """Whose policies these are."""
@@ -40,16 +45,22 @@ FIELD = (
 """By mean survival over both engines."""
 
 
+COLUMNS = {
+    "survival_s": ("mean survival [s]", 1.0),
+    "completed_fraction": ("completed [%]", 100.0),
+    "position_error": ("position error [cm]", 100.0),
+    "yaw_error": ("yaw error [deg]", 180.0 / math.pi),
+    "energy": ("energy [kJ]", 1e-3),
+}
+"""Measures of an evaluation, each with the title of its column and how many of the column's units make one of its
+own."""
+
+
 def field_table(ours: dict[str, Any] | None = None) -> str:
     """The published figures as Markdown, with a result of ours as the first row if there is one."""
-    lines = [
-        "| policy | mean survival [s] | completed [%] | position error [cm] | yaw error [deg] | energy [kJ] |",
-        "|---|---|---|---|---|---|",
-    ]
-    rows = [_cells(row) for row in FIELD]
-    if ours:
-        rows.insert(0, _own_cells(ours))
-    return "\n".join([*lines, *(f"| {' | '.join(row)} |" for row in rows)])
+    rows = [["policy", *(title for title, _ in COLUMNS.values())], *([_own_cells(ours)] if ours else [])]
+    head, *lines = (f"| {' | '.join(row)} |" for row in (*rows, *(row.cells() for row in FIELD)))
+    return "\n".join([head, "|---" * len(rows[0]) + "|", *lines])
 
 
 def beside_the_field(result: dict[str, Any]) -> str:
@@ -62,17 +73,9 @@ def beside_the_field(result: dict[str, Any]) -> str:
     return f"{field_table(result)}\n\n{note}."
 
 
-def _cells(row: Row) -> list[str]:
-    pairs = (row.survival_s, row.completed_percent, row.position_error_cm, row.yaw_error_deg, row.energy_kj)
-    return [row.policy, *("" if pair == (None, None) else " / ".join(map(_shown, pair)) for pair in pairs)]
-
-
 def _own_cells(result: dict[str, Any]) -> list[str]:
-    m = result["metrics"]
-    scales = {"survival_s": 1.0, "completed_fraction": 100.0, "position_error": 100.0,
-              "yaw_error": 180.0 / math.pi, "energy": 1e-3}  # fmt: skip
     name = f"**this policy, {result['settings']['engine']}, arms {result['method']}**"
-    return [name, *(_interval(m[measure], scale) for measure, scale in scales.items())]
+    return [name, *(_interval(result["metrics"][measure], scale) for measure, (_, scale) in COLUMNS.items())]
 
 
 def _interval(measure: dict[str, Any], scale: float) -> str:
