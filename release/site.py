@@ -20,9 +20,21 @@ OUTSIDE = {
     "README.md": "overview.md",
 }
 """Files of the repository that the site has too, and how it calls them; all of examples/ as well."""
+MEASURED = ("results_g1.md", "redundancy.md")
+"""Pages that reports write once there is a policy to measure; the site has those that are there."""
 COMMANDS = "<!-- commands -->"
 """Where a page has the table of commands."""
 _LINK = re.compile(r"(?<=\]\()([^)#:\s]+)")
+
+
+def on_config(config: MkDocsConfig) -> MkDocsConfig:
+    """Leave pages that are not written yet out of the navigation."""
+    missing = {name for name in MEASURED if not Path(config.docs_dir, name).is_file()}
+    for section in config.nav or []:
+        for title, pages in section.items():
+            if isinstance(pages, list):
+                section[title] = [page for page in pages if missing.isdisjoint(page.values())]
+    return config
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:

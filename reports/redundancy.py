@@ -1,4 +1,4 @@
-"""Whether an arm of seven joints (G1) makes CoTaP's advantages over PD more pronounced than one of four (H1).
+"""Whether an arm of seven joints (G1) makes CoTaP's advantages over PD more pronounced than one of four (H1), and why.
 
 Writes docs/redundancy.md from what `reports.reproduce_paper` has measured on both robots.
 """
@@ -11,15 +11,50 @@ import sys
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+from reports.paper import constant_load, periodic
 from reports.paper.arms import COMPLIANT, mass
 from reports.paper.book import row
-from reports.paper.words import LABELS, hundredfold
+from reports.paper.words import LABELS, hundredfold, number
 
+ROBOTS = ("h1", "g1")
 BY_MASS = ", impulse by mass"
-MODES = {mode + how: (mode, mode + how) for mode in ("stance", "walking") for how in ("", BY_MASS)}
-"""Titles of the tables, with the mode of H1 and the mode of G1 that each compares."""
+NAMES = {measure: label.rpartition(" [")[0] for measure, label in LABELS.items()} | periodic.CHANGING
+
+
+class Table(NamedTuple):
+    """Changes of one test."""
+
+    modes: tuple[str, str]
+    """Under which H1's and G1's are kept."""
+    measures: tuple[str, ...]
+    arms: tuple[str, ...]
+
+
+TABLES = {
+    f"impact, {mode}{how}": Table((mode, mode + how), tuple(LABELS), COMPLIANT)
+    for mode in ("stance", "walking")
+    for how in ("", BY_MASS)
+} | {
+    constant_load.MODE: Table(2 * (constant_load.MODE,), constant_load.CHANGING, constant_load.COMPLIANT),
+    periodic.MODE: Table(2 * (periodic.MODE,), tuple(periodic.CHANGING), (periodic.ARMS,)),
+}  # fmt: skip
+"""By title."""
+VERDICTS = ("more", "less", "cannot be distinguished", "not measured")
+ROWS = {
+    "impact, stance, K 100": ("impact-stance-K-100", ""),
+    "impact, walking, K 100": ("impact-walking-K-100", ""),
+    "constant load, K_z 100": ("load-K-z-100", ""),
+    "periodic load, left arm": ("periodic", "_left"),
+}
+"""Rows of the table of causes: names of evaluations, and what ends those of their measures."""
+CAUSES = {
+    "condition_number": ("condition number of the hand's Jacobian", number),
+    "singular_share": ("share of time above 10 [%]", hundredfold),
+    "null_share": ("share of the compliance in the null space [%]", hundredfold),
+}
+"""Measures that may say why, with their names and how they are shown."""
 HEAD = """# Does a redundant arm make CoTaP's advantages more pronounced?
 
 The paper expects so of a robot with more joints in its arms than H1's four, such as G1 with seven. It measured H1
@@ -27,28 +62,40 @@ alone. Written by `python -m reports.redundancy`: do not edit.
 
 **{answer}**
 
-A change is that of a measure from PD to CoTaP with the same policy, relative to PD, under the impact of
+A change is that of a measure from PD to CoTaP with the same policy, relative to PD, in the tests of
 [H1's page](results.md) and [G1's](results_g1.md): negative is better. Its 95 % interval is a bootstrap over the envs
 that stood under both. *More*: G1's change is lower than H1's, and the interval of the difference of the changes, from
 theirs (square-and-add), does not hold zero; *less*: it is higher. Where CoTaP is worse than PD on both robots, *more*
-means less of a disadvantage. The push is the same 25 N s on both, though G1 has {g1:.0f} kg and H1 {h1:.0f} kg; by
-mass, G1's is smaller in proportion. With 95 % intervals, about one comparison in twenty says more or less by chance.
-One training stands behind each policy, and the robots differ in more than their arms: gains, torque limits, legs."""
+means less of a disadvantage. Forces are the same on both, though G1 has {g1:.0f} kg and H1 {h1:.0f} kg; by mass, G1's
+push is smaller in proportion. Under the periodic load, both arms are those of one robot, the left under CoTaP, the
+right under PD. With 95 % intervals, about one comparison in twenty says more or less by chance. One training stands
+behind each policy, and the robots differ in more than their arms: gains, torque limits, legs.
+
+## On which measures"""
+WHY = """## Why
+
+What differs between the arms, in the measured time, over the envs that stood. Where the condition number is above 10,
+an arm is so near to singular that compliance gives way to PD; numbers above 50 count as 50. The null space is motion of
+the joints that leaves the hand where it is: one direction on H1, four on G1. Its share is that of the trace of the
+joints' compliance matrix; under PD with equal gains it is 25 % with four joints and 57 % with seven. Less time above 10
+leaves more of the compliance that was asked for, and a larger share of the null space lets joints yield whose torque
+does nothing for the hand. Where both hold and a measure is not more pronounced, something else decides it."""
 
 
-def verdict(h1: dict[str, Any], g1: dict[str, Any]) -> str:
-    """`more`, `less` or `cannot be distinguished`, of two relative changes; or why there is none."""
+def verdict(h1: dict[str, Any], g1: dict[str, Any], lower: str = "more", higher: str = "less") -> str:
+    """Whether G1's is `lower` or `higher` than H1's, of two changes or measures, or `cannot be distinguished`; or why
+    there is none."""
     from cotap.compare import difference
 
     d = difference(h1, g1)
     if d["difference"] is None:
         return "not measured"
     low, high = d["ci95"]
-    return "more" if high < 0.0 else "less" if low > 0.0 else "cannot be distinguished"
+    return lower if high < 0.0 else higher if low > 0.0 else "cannot be distinguished"
 
 
-def read_changes(path: Path, robot: str) -> dict[str, Any]:
-    """The changes in a robot's results.json. Raises ValueError where it is missing, foreign or without any."""
+def read_results(path: Path, robot: str) -> dict[str, Any]:
+    """A robot's results.json. Raises ValueError where it is missing, foreign or without any changes."""
     command = f"python -m reports.reproduce_paper --robot {robot}"
     if not path.is_file():
         raise ValueError(f"there is no file {str(path)!r}; {command} writes it")
@@ -61,13 +108,14 @@ def read_changes(path: Path, robot: str) -> dict[str, Any]:
         raise ValueError(f"{str(path)!r} must be of robot {robot!r}, got {found!r}")
     if not content.get("changes"):
         raise ValueError(f"{str(path)!r} has no changes from PD to CoTaP: {command} with the part impact measures them")
-    return content["changes"]
+    return content
 
 
 def page(h1: dict[str, Any], g1: dict[str, Any]) -> str:
-    """The page, from the changes of both robots by mode, arms and measure."""
-    lines, verdicts = [], Counter()
-    for title, (of_h1, of_g1) in MODES.items():
+    """The page, from what was measured on both robots."""
+    lines: list[str] = []
+    verdicts = {name: Counter[str]() for name in NAMES.values()}
+    for title, table in TABLES.items():
         lines += [
             "",
             f"## {title.capitalize()}",
@@ -75,15 +123,34 @@ def page(h1: dict[str, Any], g1: dict[str, Any]) -> str:
             row("measure", "arms", "H1 [%]", "G1 [%]", "on G1"),
             "|---" * 5 + "|",
         ]
-        for measure, name in LABELS.items():
-            for arms in COMPLIANT:
+        for measure in table.measures:
+            for arms in table.arms:
                 pair = [
-                    changes.get(mode, {}).get(arms, {}).get(measure) for changes, mode in ((h1, of_h1), (g1, of_g1))
+                    content["changes"].get(mode, {}).get(arms, {}).get(measure)
+                    for content, mode in zip((h1, g1), table.modes, strict=True)
                 ]
                 found = verdict(*pair) if all(pair) else "not measured"
-                verdicts[found] += 1
-                lines.append(row(name.rpartition(" [")[0], arms, *map(hundredfold, pair), found))
-    return "\n".join([HEAD.format(answer=answer(verdicts), h1=mass("h1"), g1=mass("g1")), *lines, ""])
+                verdicts[NAMES[measure]][found] += 1
+                lines.append(row(NAMES[measure], arms, *map(hundredfold, pair), found))
+    total = sum(verdicts.values(), Counter[str]())
+    weights = dict(zip(ROBOTS, map(mass, ROBOTS), strict=True))
+    counts = [row(name, *(str(found[v]) for v in VERDICTS)) for name, found in verdicts.items()]
+    head = [HEAD.format(answer=answer(total), **weights), "", row("measure", *VERDICTS), "|---" * 5 + "|", *counts]
+    return "\n".join([*head, "", WHY, *causes(h1, g1), *lines, ""])
+
+
+def causes(h1: dict[str, Any], g1: dict[str, Any]) -> list[str]:
+    """The table of what may say why."""
+    lines = ["", row("figure", "test", "H1", "G1", "on G1"), "|---" * 5 + "|"]
+    for measure, (name, shown) in CAUSES.items():
+        for title, (key, suffix) in ROWS.items():
+            pair = [
+                content.get("rows", {}).get(key, {}).get("metrics_without_falls", {}).get(measure + suffix)
+                for content in (h1, g1)
+            ]
+            found = verdict(*pair, "lower", "higher") if all(pair) else "not measured"
+            lines.append(row(name, title, *map(shown, pair), found))
+    return lines
 
 
 def answer(verdicts: Counter[str]) -> str:
@@ -98,14 +165,15 @@ def answer(verdicts: Counter[str]) -> str:
 def main(argv: Sequence[str] | None = None) -> int:
     """Read both, write the page. Returns the exit status; bad input ends the program with 2."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--h1", type=Path, default=Path("docs/results/h1/results.json"), help="results.json of H1")
-    parser.add_argument("--g1", type=Path, default=Path("docs/results/g1/results.json"), help="results.json of G1")
+    for robot in ROBOTS:
+        default = Path(f"docs/results/{robot}/results.json")
+        parser.add_argument(f"--{robot}", type=Path, default=default, help=f"results.json of {robot.upper()}")
     parser.add_argument("--output", type=Path, default=Path("docs/redundancy.md"), help="the page")
     options = parser.parse_args(argv)
     from cotap.files import write_atomically
 
     try:
-        text = page(read_changes(options.h1, "h1"), read_changes(options.g1, "g1"))
+        text = page(*(read_results(getattr(options, robot), robot) for robot in ROBOTS))
         write_atomically(options.output, lambda p: p.write_text(text, encoding="utf-8"))
     except (ValueError, OSError) as error:
         parser.error(str(error))

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from reports import redundancy
-from reports.paper.arms import COMPLIANT
-from reports.paper.words import LABELS
+from reports.paper import constant_load, impact, periodic, relative
+from reports.paper.book import Book
 
 
 def change(mean: float, half: float = 0.01) -> dict[str, Any]:
@@ -31,21 +32,78 @@ def test_what_was_not_measured_has_no_verdict():
     assert redundancy.verdict(change(0.1), none) == "not measured"
 
 
-def write(path: Path, robot: str, mean: float, modes: tuple[str, ...]) -> str:
-    changes = {mode: {arms: {m: change(mean) for m in LABELS} for arms in COMPLIANT} for mode in modes}
-    path.write_text(json.dumps({"robot": robot, "changes": changes}))
+def write(path: Path, robot: str, mean: float, modes: tuple[str, ...], rows: dict[str, Any] | None = None) -> str:
+    tables = {mode: table for table in redundancy.TABLES.values() for mode in table.modes}
+    changes = {
+        mode: {arms: {m: change(mean) for m in tables[mode].measures} for arms in tables[mode].arms} for mode in modes
+    }
+    path.write_text(json.dumps({"robot": robot, "changes": changes, "rows": rows or {}}))
     return str(path)
 
 
+LOADS = ("constant load", "periodic load")
+
+
 def test_the_page_compares_every_mode(tmp_path):
-    h1 = write(tmp_path / "h1.json", "h1", -0.1, ("stance", "walking"))
-    g1 = write(tmp_path / "g1.json", "g1", -0.2, ("stance", "walking", "stance, impulse by mass"))
+    h1 = write(tmp_path / "h1.json", "h1", -0.1, ("stance", "walking", *LOADS))
+    g1 = write(tmp_path / "g1.json", "g1", -0.2, ("stance", "walking", "stance, impulse by mass", *LOADS))
     out = tmp_path / "docs.md"
     assert redundancy.main(["--h1", h1, "--g1", g1, "--output", str(out)]) == 0
     page = out.read_text()
     assert "| e_torso | K 100 | -10.0 [-11.0,-9.0] | -20.0 [-21.0,-19.0] | more |" in page
-    assert "**Of 75 comparisons 75 say more, 0 less, and 0 cannot be distinguished; 25 were not measured.**" in page
-    assert "| e_torso | K 100 | -10.0 [-11.0,-9.0] | (not measured) | not measured |" in page.split("## Walking")[2]
+    # Impacts: 5 measures of 5 arms in 4 tables; constant load: 3 of 4 arms; periodic load: 3 of one.
+    assert "**Of 90 comparisons 90 say more, 0 less, and 0 cannot be distinguished; 25 were not measured.**" in page
+    assert (
+        "| e_torso | K 100 | -10.0 [-11.0,-9.0] | (not measured) | not measured |"
+        in page.split("## Impact, walking")[2]
+    )
+    assert "| e_torso | 19 | 0 | 0 | 5 |" in page
+    assert "| elbow torque, rms | 1 | 0 | 0 | 0 |" in page
+    assert page.count("| K_z 500 | -10.0 [-11.0,-9.0] | -20.0 [-21.0,-19.0] | more |") == 3
+    assert "| work of the arm | alpha 0.7, K 500 |" in page
+    for table in re.findall(r"(?:^\|.*\n)+", page, re.M):
+        assert len({line.count("|") for line in table.splitlines()}) == 1
+
+
+def test_what_may_say_why_is_compared(tmp_path):
+    def rows(singular: float, null: float) -> dict[str, Any]:
+        measures = {"condition_number": change(5.0), "singular_share": change(singular), "null_share": change(null)}
+        left = {f"{name}_left": value for name, value in measures.items()}
+        return {"impact-stance-K-100": {"metrics_without_falls": measures}, "periodic": {"metrics_without_falls": left}}
+
+    h1 = write(tmp_path / "h1.json", "h1", -0.1, LOADS, rows(0.3, 0.1))
+    g1 = write(tmp_path / "g1.json", "g1", -0.1, LOADS, rows(0.05, 0.4))
+    redundancy.main(["--h1", h1, "--g1", g1, "--output", str(tmp_path / "out.md")])
+    page = (tmp_path / "out.md").read_text()
+    name = "share of time above 10 [%]"
+    assert f"| {name} | impact, stance, K 100 | 30.0 [29.0,31.0] | 5.0 [4.0,6.0] | lower |" in page
+    assert "| 10.0 [9.0,11.0] | 40.0 [39.0,41.0] | higher |" in page
+    assert "| periodic load, left arm | 5.000 [4.990,5.010] | 5.000 [4.990,5.010] | cannot be distinguished |" in page
+    assert f"| {name} | constant load, K_z 100 | (not measured) | (not measured) | not measured |" in page
+
+
+def test_the_rows_of_the_causes_are_evaluations_of_the_page():
+    """Their names are made of those of arms, elsewhere."""
+    assert redundancy.ROWS["impact, stance, K 100"][0] == impact.key("stance", "K 100")
+    assert redundancy.ROWS["impact, walking, K 100"][0] == impact.key("walking", "K 100")
+    assert redundancy.ROWS["constant load, K_z 100"][0] == constant_load.key("K_z 100")
+
+
+def test_changes_from_pd_are_kept_of_loads_too(tmp_path):
+    """Twice the torque at the elbow, half of it under PD on the right; a hand that goes three times as far."""
+    book = Book("h1", tmp_path, tmp_path)
+    stood = {"stood": [1.0, 1.0]}
+    far = {m: [1.0, 1.0] for m in constant_load.CHANGING}
+    book.results["load-PD"] = {"per_env": stood | far}
+    book.results["load-K-z-500"] = {"per_env": stood | far | {"e_ee_hit": [3.0, 3.0]}}
+    relative.keep_changes(book, "constant load", "load", constant_load.COMPLIANT, constant_load.CHANGING)
+    ((arms, changes),) = book.changes["constant load"].items()
+    assert arms == "K_z 500"
+    assert {m: c["mean"] for m, c in changes.items()} == {"e_torso": 0.0, "e_ee_hit": 2.0, "j_upper": 0.0}
+    sides = {f"{m}_{side}": [value] * 2 for m in periodic.CHANGING for side, value in (("left", 1.0), ("right", 2.0))}
+    book.results["periodic"] = {"per_env": stood | sides}
+    relative.keep_changes_of_sides(book, "periodic load", "periodic", "x", periodic.CHANGING)
+    assert [c["mean"] for c in book.changes["periodic load"]["x"].values()] == [-0.5] * 3
 
 
 @pytest.mark.parametrize(

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import copy
 import subprocess
 import sys
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 from urllib.parse import unquote, urldefrag
 
 import pytest
+from mkdocs.config.defaults import MkDocsConfig
 
 from cotap.command_help import load_commands
+from release import site as release_site
 
 ROOT = Path(__file__).parents[1]
 LOADED = {"script": "src", "img": "src", "link": "href", "iframe": "src", "source": "src"}
@@ -48,6 +52,32 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def pages(site: Path) -> dict[Path, Page]:
     return {file: Page(file) for file in site.rglob("*.html") if file.name != "404.html"}
+
+
+def pages_of(nav: list[Any]) -> set[str]:
+    """All pages of a navigation."""
+    return {page for section in nav for pages in section.values() for part in pages for page in part.values()}
+
+
+def test_pages_that_are_not_measured_yet_are_left_out(tmp_path: Path):
+    """And only these: any other page that is missing is an error of the site."""
+    config = MkDocsConfig()
+    config.docs_dir = str(tmp_path)
+    nav = [{"Results": [{"Ships": "shipped.md"}, {"On G1": "results_g1.md"}, {"Arms": "redundancy.md"}]}]
+    for there, expected in (
+        ([], {"shipped.md"}),
+        (["redundancy.md"], {"shipped.md", "redundancy.md"}),
+        (["results_g1.md"], {"shipped.md", "results_g1.md", "redundancy.md"}),
+    ):
+        for name in there:
+            (tmp_path / name).touch()
+        config.nav = copy.deepcopy(nav)
+        assert pages_of(release_site.on_config(config).nav or []) == expected
+
+
+def test_what_reports_may_write_is_in_the_navigation():
+    written = (ROOT / "mkdocs.yml").read_text()
+    assert [name for name in release_site.MEASURED if f": {name}\n" not in written] == []
 
 
 @pytest.mark.slow

@@ -5,9 +5,11 @@ from __future__ import annotations
 from reports.paper.arms import PD, cotap
 from reports.paper.book import Book, slug
 from reports.paper.figures import plot_curves
+from reports.paper.relative import keep_changes
 from reports.paper.tables import LOAD
 from reports.paper.words import fallen, missing, number, of, the_paper, verdict
 
+MODE = "constant load"
 ROWS = {
     "K_z 100": cotap(300, 300, 100),
     "K_z 500": cotap(300, 300, 500),
@@ -15,6 +17,9 @@ ROWS = {
     PD: ["--method", "pd"],
     "alpha 0.5": cotap(300, 300, 100, 0.5),
 }
+COMPLIANT = tuple(name for name in ROWS if name != PD)
+CHANGING = ("e_torso", "e_ee_hit", "j_upper")
+"""Measures of which the change from PD is kept."""
 CLAIMS = (
     ("Hand error at K_z 500 below that at 100", "K_z 500", "K_z 100", "e_ee_hit"),
     ("Hand error at alpha 0.5 below that at K_z 100", "alpha 0.5", "K_z 100", "e_ee_hit"),
@@ -61,6 +66,7 @@ def constant_load(book: Book) -> None:
         over = number(m.get("load_overshoot"), 2)
         book.row(name, number(m["displacement_z"]), number(m["e_ee_hit"]), over, fallen(result), last=paper)
         curves[name] = (curve["time"], curve.get("hand_displacement_z", []))
+    keep_changes(book, MODE, "load", COMPLIANT, CHANGING)
     book.paragraph(
         WHY,
         paper=the_paper(book),

@@ -4,9 +4,15 @@ from __future__ import annotations
 
 from reports.paper.arms import NULL_STIFFNESS
 from reports.paper.book import Book
+from reports.paper.relative import keep_changes_of_sides
 from reports.paper.words import fallen, missing, number, of, the_paper
 
 LEFT = f"cotap:alpha=0.7,stiffness=500,null_stiffness={NULL_STIFFNESS}"
+MODE, ARMS = "periodic load", "alpha 0.7, K 500"
+CHANGING = {
+    "elbow_amplitude": "elbow torque, amplitude", "elbow_rms": "elbow torque, rms", "energy": "work of the arm",
+}  # fmt: skip
+"""Measures of which the change from the arm under PD to the other is kept."""
 ROWS = (
     ("elbow torque, amplitude [Nm]", "elbow_amplitude", 2, "left much smaller"),
     ("the same from statics [Nm]", "elbow_amplitude_static", 2, "-"),
@@ -29,6 +35,7 @@ def periodic(book: Book) -> None:
     )
     book.table("", "left", "right", "left over right", book.paper)
     result = book.run("periodic", "cotap", "periodic-load", "--left", LEFT, "--right", "pd")
+    keep_changes_of_sides(book, MODE, "periodic", ARMS, CHANGING)
     for title, measure, digits, paper in ROWS:
         if result is None:
             book.row(title, missing("cotap"), last=paper)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -43,13 +43,23 @@ def relative_change(
     return {"mean": float(new.mean() / old.mean() - 1.0), "ci95": [low, high], "n": n}
 
 
-def keep_changes(book: Book, mode: str, prefix: str) -> None:
-    """Put the changes of a mode into the book: of all rows under CoTaP whose names begin with `prefix`."""
+def keep_changes(
+    book: Book, mode: str, prefix: str, rows: Iterable[str] = COMPLIANT, measures: Iterable[str] = tuple(LABELS)
+) -> None:
+    """Put the changes of a mode into the book: of these rows under CoTaP, whose names begin with `prefix`."""
     pd = book.results.get(f"{prefix}-PD")
-    rows = {arms: book.results.get(f"{prefix}-{slug(arms)}") for arms in COMPLIANT}
+    found = {arms: book.results.get(f"{prefix}-{slug(arms)}") for arms in rows}
     if pd is not None:
         book.changes[mode] = {
-            arms: {measure: relative_change(pd["per_env"], result["per_env"], measure) for measure in LABELS}
-            for arms, result in rows.items()
+            arms: {measure: relative_change(pd["per_env"], result["per_env"], measure) for measure in measures}
+            for arms, result in found.items()
             if result is not None
         }
+
+
+def keep_changes_of_sides(book: Book, mode: str, name: str, arms: str, measures: Iterable[str]) -> None:
+    """The same of one evaluation, from its right arm, which is under PD, to its left one, under CoTaP."""
+    if (result := book.results.get(name)) is not None:
+        envs = result["per_env"]
+        right, left = (envs | {m: envs[f"{m}_{side}"] for m in measures} for side in ("right", "left"))
+        book.changes[mode] = {arms: {m: relative_change(right, left, m) for m in measures}}

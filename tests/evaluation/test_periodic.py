@@ -47,13 +47,16 @@ def test_swing_measures_by_hand(spec):
 @pytest.mark.slow
 def test_a_slow_load_asks_for_the_same_torque_whatever_the_stiffness():
     """Fixed pelvis, compliant left arm, PD on the right: torques are those of statics, the left hand swings more."""
-    protocol = PeriodicLoad(num_envs=1, pelvis="fixed", randomize=False, force=(0.0, 0.0, 10.0), periods=2)
+    given = {"pelvis": "fixed", "randomize": False, "force": (0.0, 0.0, 10.0), "periods": 2, "per_env": True}
+    protocol = PeriodicLoad(num_envs=1, **given)
     cfg = protocol.configure(HumanoidEnvConfig(num_threads=1))
     cfg.upper_body = LawOptions(left="cotap:alpha=1,stiffness=400", right="pd").configure()
     env = HumanoidEnv(cfg)
     protocol.prepare(env)
     t = record_rollout(env, idle(env), round(protocol.seconds / env.dt), progress=False)
-    m = {k: v["mean"] for k, v in protocol.measure(t, env)["metrics"].items()}
+    measured = protocol.measure(t, env)
+    m = {k: v["mean"] for k, v in measured["metrics"].items()}
+    assert measured["per_env"]["hand_swing_left"] == [pytest.approx(m["hand_swing_left"], rel=1e-4)]
     for side in ("left", "right"):
         assert m[f"elbow_amplitude_{side}"] == pytest.approx(m[f"elbow_amplitude_static_{side}"], rel=0.02)
     assert m["elbow_amplitude_ratio"] == pytest.approx(1.0, abs=0.05)

@@ -88,6 +88,15 @@ class Impact(Scenario):
         env_cfg.forces.scripted = self._profile()
         return env_cfg
 
+    def measured_steps(self, dt: float) -> range:
+        """Control steps of the window."""
+        onset = round(self.onset / dt)
+        return range(*(onset + round(bound / dt) for bound in self.window))
+
+    def before_step(self, env: HumanoidEnv, step: int) -> None:
+        """Follow the arms through the window."""
+        self.watch.see(env, step, self.measured_steps(env.dt))
+
     def hit(self, env: HumanoidEnv) -> list[int]:
         """Indices of the hands whose error is `e_ee_hit`: those that the force is on, all for a force on the base."""
         return [i for i, a in enumerate(env.spec.arms) if self.place == "base" or self.hand in (a.side, "both")]
@@ -95,8 +104,8 @@ class Impact(Scenario):
     def measure(self, trajectory: Trajectory, env: HumanoidEnv) -> dict[str, Any]:
         """The measured part of the evaluation's JSON, the number of falls aside."""
         t, hit = trajectory, self.hit(env)
-        onset = round(self.onset / t.dt)
-        begin, end = (onset + round(bound / t.dt) for bound in self.window)
+        onset, measured = round(self.onset / t.dt), self.measured_steps(t.dt)
+        begin, end = measured.start, measured.stop
         stood = ~t.fell.any(0)
         everyone = torch.ones_like(stood)
         window = window_measures(t, begin, end, hit)
@@ -112,6 +121,7 @@ class Impact(Scenario):
             window["impedance_error"] = impedance_error(window, self.force, commanded)
         fall_end = onset + round(self.fall_seconds / t.dt)
         window["fall_fraction"] = t.fell[:fall_end].any(0)
+        window |= self.watch.measures(t.alive()[begin:end], hit)
         return {
             "falls": falls_by_time(t, onset, fall_end),
             "metrics": summaries(window, everyone, self.seed),

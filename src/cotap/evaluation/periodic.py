@@ -12,7 +12,7 @@ import torch
 from cotap.checks import require_finite, require_range
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.scripted_forces import ForceProfile
-from cotap.evaluation.disturbance import falls_by_time, window_measures
+from cotap.evaluation.disturbance import falls_by_time, per_env_figures, window_measures
 from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.metrics import summaries
 from cotap.evaluation.report import pyplot, save_figure
@@ -40,6 +40,8 @@ class PeriodicLoad(Scenario):
     """Number of periods. All but the first are measured."""
     onset: float = 1.0
     """When the load begins [s]."""
+    per_env: bool = False
+    """Write the figures of every env as well. `cotap compare` then compares env by env."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
@@ -61,13 +63,24 @@ class PeriodicLoad(Scenario):
         env_cfg.forces.scripted = ForceProfile(self.force, self.hand, self.onset, self.seconds, self.period)
         return env_cfg
 
+    def measured_steps(self, dt: float) -> range:
+        """Control steps of all periods but the first."""
+        return range(*(round(s / dt) for s in (self.onset + self.period, self.seconds)))
+
+    def before_step(self, env: HumanoidEnv, step: int) -> None:
+        """Follow the arms through these steps."""
+        self.watch.see(env, step, self.measured_steps(env.dt))
+
     def measure(self, trajectory: Trajectory, env: HumanoidEnv) -> dict[str, Any]:
         """The measured part of the evaluation's JSON, the number of falls aside."""
         t = trajectory
-        begin, end = (round(s / t.dt) for s in (self.onset + self.period, self.seconds))
+        measured = self.measured_steps(t.dt)
+        begin, end = measured.start, measured.stop
         elbows, sides = elbow_joints(env.spec), [arm.side for arm in env.spec.arms]
         hit = [i for i, side in enumerate(sides) if self.hand in (side, "both")]
         measures = window_measures(t, begin, end, hit) | swing_measures(t, begin, end, self.period, elbows, sides)
+        for i, side in enumerate(sides):
+            measures |= self.watch.measures(t.alive()[begin:end], [i], f"_{side}")
         stood = ~t.fell.any(0)
         return {
             "falls": falls_by_time(t, round(self.onset / t.dt), end),
@@ -75,6 +88,7 @@ class PeriodicLoad(Scenario):
             "metrics_without_falls": summaries(measures, stood, self.seed),
             "window": {"start": self.onset + self.period, "end": self.seconds},
             "curve": swing_curve(t, round(self.onset / t.dt), elbows, sides),
+            **({"per_env": per_env_figures(measures, stood)} if self.per_env else {}),
         }
 
     def plot(self, path: Path, result: dict[str, Any]) -> None:

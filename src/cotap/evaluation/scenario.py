@@ -9,6 +9,7 @@ import torch
 
 from cotap.checks import require_one_of, require_range
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
+from cotap.evaluation.arm_watch import ArmWatch
 from cotap.evaluation.protocol import Protocol, RolloutProtocol
 from cotap.motions.reference import HELD
 
@@ -63,3 +64,7 @@ class Scenario(RolloutProtocol, Stance, ABC):
 
     motion: tuple[str, ...] = (HELD,)
     """Clips for the arms, `mixture` or `none`. mixture: as in the training. none: hold --arm-pose."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.watch = ArmWatch()
