@@ -8,12 +8,15 @@ from dataclasses import dataclass
 import torch
 
 COMMANDS = ("constant", "sine", "steps", "random", "knowing")
-"""How stiffness is commanded: not at all; swinging or jumping at 0.5 to 2 times the natural frequency of the hand;
-drawn anew as often; stiff or soft by where the hand is, where it goes, and whether it is pulled or braked."""
-GENES = 13
-_DIRECTION, _SIZE, _RATE, _PHASE, _BRAKE, _LAST, _RATIO, _SHIFT, _DEPTH, _WAY, _FAR = slice(0, 3), *range(3, 13)
+"""How stiffness and alpha are commanded: not at all; swinging or jumping at 0.5 to 2 times the natural frequency of the
+hand; drawn anew as often; by where the hand is, where it goes, and whether it is pulled or braked."""
+GENES = 21
+_DIRECTION, _SIZE, _RATE, _PHASE, _BRAKE, _LAST, _RATIO, _SHIFT = slice(0, 3), *range(3, 10)
+_DEPTH, _WAY, _FAR, _ACROSS, _CIRCLE, _SPIN, _ALPHA = slice(10, 13), 13, 14, slice(15, 18), *range(18, 21)
 _REACH = 0.05
 """What counts as far from the target [m]."""
+_LEAST_SPREAD = 0.15
+"""Standard deviation of what the search adds to a gene on which all of the best exciters agree."""
 
 
 @dataclass(frozen=True)
@@ -33,9 +36,10 @@ class Limits:
 class Exciters:
     """One exciter for each of N hands.
 
-    In turns, it pulls the hand along a direction and brakes what the hand then does: braking takes energy out. A turn
-    takes half a period of a 16th to twice the hand's natural frequency; from a moment of its own on, it only brakes. It
-    knows where the hand is and how fast it moves at every control step.
+    In turns, it pulls the hand and brakes what the hand then does: braking takes energy out. A turn takes between the
+    whole time and a quarter of the hand's natural period; from a moment of its own on, it only brakes. The pull is
+    steady along a direction, or leads the hand around a circle beside its target, or anything between the two. It knows
+    where the hand is and how fast it moves at every control step.
 
     Args:
         genes: (N, GENES) any numbers; of the order of 1.
@@ -49,14 +53,19 @@ class Exciters:
         self, genes: torch.Tensor, command: torch.Tensor, natural: torch.Tensor, limits: Limits, seed: int
     ) -> None:
         g, self._limits, self._command = genes, limits, command
-        direction = g[:, _DIRECTION]
-        self._direction = direction / direction.norm(dim=1, keepdim=True).clamp_min(1e-6)
+        self._direction = _unit(g[:, _DIRECTION])
+        across = g[:, _ACROSS]
+        self._across = _unit(across - (across * self._direction).sum(1, keepdim=True) * self._direction)
+        self._circle = g[:, _CIRCLE, None].clamp(0.0, 1.0)
         self._size = limits.force * g[:, _SIZE].sigmoid()
-        self._rate, self._phase = natural * 2.0 ** (2.5 * g[:, _RATE].tanh() - 1.5), math.pi * g[:, _PHASE]
-        self._brake = limits.brake * g[:, _BRAKE].sigmoid()
+        slowest, fastest = math.pi / limits.seconds, 2.0 * natural
+        self._rate = slowest * (fastest / slowest) ** g[:, _RATE].sigmoid()
+        self._spin = 2.0 * slowest * (fastest / slowest) ** g[:, _SPIN].sigmoid()
+        self._phase, self._brake = math.pi * g[:, _PHASE], limits.brake * g[:, _BRAKE].sigmoid()
         self._last = limits.seconds * g[:, _LAST].sigmoid()
         self._ratio, self._shift = natural * 2.0 ** g[:, _RATIO].tanh(), math.pi * g[:, _SHIFT]
-        self._depth, self._way, self._far = g[:, _DEPTH].tanh(), g[:, _WAY], g[:, _FAR]
+        self._depth, self._alpha = (1.0 + 2.0 * g[:, _DEPTH]).clamp(-1.0, 1.0), g[:, _ALPHA].clamp(-1.0, 1.0)
+        self._way, self._far = g[:, _WAY], g[:, _FAR]
         self._rng = torch.Generator().manual_seed(seed)
         self._held = torch.zeros_like(self._size)
         self._turn = torch.full_like(self._size, -1.0)
@@ -67,11 +76,24 @@ class Exciters:
 
     def force(self, time: float, velocity: torch.Tensor) -> torch.Tensor:
         """Force (N, 3) on the hands [N], at their velocities (N, 3) [m/s]."""
-        pull = self._size.unsqueeze(1) * self._direction
+        angle = (self._spin * time).unsqueeze(1)
+        around = angle.sin() * self._across - angle.cos() * self._direction
+        pull = self._size.unsqueeze(1) * torch.lerp(self._direction, around, self._circle)
         return torch.where(self._pulls(time).unsqueeze(1), pull, -self._brake.unsqueeze(1) * velocity)
 
-    def stiffness(self, time: float, offset: torch.Tensor, velocity: torch.Tensor) -> torch.Tensor:
-        """Stiffness (N,) that is commanded [N/m], for hands off their targets by `offset` (N, 3) [m]."""
+    def command(self, time: float, offset: torch.Tensor, velocity: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """What is commanded, for hands off their targets by `offset` (N, 3) [m].
+
+        Returns:
+            Stiffness (N, 3) along the axes [N/m], and the share (N,) of its first alpha that a law is to have.
+        """
+        level = self._level(time, offset, velocity)
+        low, high = (math.log(bound) for bound in self._limits.stiffness)
+        along = self._depth * level.unsqueeze(1)
+        return (0.5 * (low + high) + 0.5 * (high - low) * along).exp(), 1.0 - (self._alpha * level).clamp_min(0.0)
+
+    def _level(self, time: float, offset: torch.Tensor, velocity: torch.Tensor) -> torch.Tensor:
+        """(N,) in [-1, 1]: how far from their mean the commands are."""
         wave = torch.sin(self._ratio * time + self._shift)
         turn = torch.floor(self._ratio * time / math.pi)  # two draws in a period
         drawn = 2.0 * torch.rand(len(turn), generator=self._rng).to(turn.device) - 1.0
@@ -79,39 +101,32 @@ class Exciters:
         going_out = (offset * velocity).sum(1) / (offset.norm(dim=1) * velocity.norm(dim=1)).clamp_min(1e-6)
         far = (offset.norm(dim=1) / _REACH - 1.0).clamp(-1.0, 1.0)
         cue = self._far * far - (1.0 + self._way) * going_out - torch.where(self._pulls(time), 1.0, -1.0)
-        by_command = torch.stack((torch.zeros_like(wave), self._depth * wave, wave.sign(), self._held, cue.sign()))
-        level = by_command.gather(0, self._command.unsqueeze(0)).squeeze(0)
-        low, high = (math.log(bound) for bound in self._limits.stiffness)
-        return (0.5 * (low + high) + 0.5 * (high - low) * level).exp()
+        by_command = torch.stack((torch.zeros_like(wave), wave, wave.sign(), self._held, cue.sign()))
+        return by_command.gather(0, self._command.unsqueeze(0)).squeeze(0)
+
+
+def _unit(vectors: torch.Tensor) -> torch.Tensor:
+    return vectors / vectors.norm(dim=1, keepdim=True).clamp_min(1e-6)
 
 
 def next_generation(
-    genes: torch.Tensor, worth: torch.Tensor, group: torch.Tensor, rng: torch.Generator, spread: float
+    genes: torch.Tensor, worth: torch.Tensor, group: torch.Tensor, rng: torch.Generator
 ) -> torch.Tensor:
-    """Genes (N, G) to try next: in each group the best quarter stay, and the others are near one of them.
+    """Genes (N, G) to try next, in each group near one of its best quarter.
+
+    As far apart as these best ones are, gene by gene: what they agree on is searched closely, and all else widely.
 
     Args:
-        genes: (N, G) that were tried.
+        genes: (N, G) the best so far, of each one.
         worth: (N,) what each got; larger is better, NaN is worst.
         group: (N,) number of its group, from 0; groups do not mix.
         rng: On the CPU.
-        spread: Standard deviation of what is added.
     """
     out, worth = genes.clone(), worth.nan_to_num(-math.inf, math.inf)
     for number in range(int(group.max()) + 1):
         mine = (group == number).nonzero().squeeze(1)
-        ranked = mine[worth[mine].argsort(descending=True)]
-        best = ranked[: max(1, len(ranked) // 4)]
-        others = ranked[len(best) :]
-        parents = best[torch.randint(0, len(best), (len(others),), generator=rng)]
-        out[others] = genes[parents] + spread * torch.randn(len(others), genes.shape[1], generator=rng)
-    return out
-
-
-def best_of(genes: torch.Tensor, worth: torch.Tensor, group: torch.Tensor) -> torch.Tensor:
-    """The best genes (N, G) of each one's group."""
-    out, worth = genes.clone(), worth.nan_to_num(-math.inf, math.inf)
-    for number in range(int(group.max()) + 1):
-        mine = (group == number).nonzero().squeeze(1)
-        out[mine] = genes[mine[worth[mine].argmax()]]
+        best = genes[mine[worth[mine].argsort(descending=True)][: max(2, len(mine) // 4)]]
+        spread = (1.3 * best.std(0, correction=0)).clamp_min(_LEAST_SPREAD)
+        parents = best[torch.randint(0, len(best), (len(mine),), generator=rng)]
+        out[mine] = parents + spread * torch.randn(parents.shape, generator=rng)
     return out

@@ -16,7 +16,7 @@ from cotap.compliance.dynamics import joint_inertia
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.scripted_forces import ForceProfile
 from cotap.envs.state import RobotState
-from cotap.evaluation.exciter import COMMANDS, GENES, Exciters, Limits, best_of, next_generation
+from cotap.evaluation.exciter import COMMANDS, GENES, Exciters, Limits, next_generation
 from cotap.evaluation.law_options import LawOptions, parse_law
 from cotap.evaluation.metrics import summarize
 from cotap.evaluation.protocol import HELD, mirrored_pose, select_motion
@@ -25,9 +25,6 @@ from cotap.evaluation.rollout import UPPER_ACTIONS, PolicyFunction, acting, pict
 from cotap.evaluation.scenario import Stance
 from cotap.evaluation.stability import NOTHING_J, random_poses
 from cotap.rotations import rotate
-
-_EXPLORED = 0.5
-"""Standard deviation of what the search adds at first; it ends at a fifth of it."""
 
 
 @dataclass
@@ -68,6 +65,15 @@ class Tally:
         most = torch.where(self.fell, math.inf, self.most) if diverged else self.most
         return Tally(*(x.cpu() for x in (self.drawn, most, self.taken, self.given, self.store, self.fell)))
 
+    def or_better(self, other: Tally) -> Tally:
+        """Of each exciter what was worth more, with the lowest store and the falls of both."""
+        better = other.worth > self.worth
+        kept = {
+            name: torch.where(better, getattr(other, name), getattr(self, name))
+            for name in ("drawn", "most", "taken", "given")
+        }
+        return replace(self, **kept, store=torch.fmin(self.store, other.store), fell=self.fell | other.fell)
+
     @property
     def worth(self) -> torch.Tensor:
         """(N,) what a search should make larger: what is drawn, or else the share that came back, less 1."""
@@ -83,7 +89,7 @@ class Passivity(Stance):
         "method": "--compared", "passive": "--compared", "stiffness": "--stiffness-range",
     }  # fmt: skip
 
-    num_envs: int = 480
+    num_envs: int = 640
     """Number of exciters. They are dealt evenly to the laws and the ways of commanding stiffness."""
     randomize: bool = False
     """Vary masses, friction, gains and delay."""
@@ -95,8 +101,9 @@ class Passivity(Stance):
         "pd", "cotap", "cotap:passive=true", "cotap:damping=pd", "cotap:damping=pd,passive=true", "facet", "hmc", "dcc",
     )  # fmt: skip
     """Laws, such as cotap:passive=true,store_energy=1. Each is on both arms."""
-    generations: int = 5
-    """Generations of the search for the best exciter. Each law and way of commanding stiffness has its own."""
+    generations: int = 8
+    """Generations of the search for the best exciter. Each law and way of commanding stiffness has its own search, in
+    which every exciter has a pose of its own."""
     episode_seconds: float = 4.0
     """Time that an exciter has [s]."""
     settle_seconds: float = 2.0
@@ -149,22 +156,24 @@ class Passivity(Stance):
                 env.set_law(i, arm, law)
 
     def evaluate(self, env: HumanoidEnv, policy: PolicyFunction) -> dict[str, Any]:
-        """Search, then try what was found at many poses. Returns the measured part of the JSON."""
+        """Search, at a pose of its own for every exciter. Returns the measured part of the JSON."""
         rng = torch.Generator().manual_seed(self.seed)
-        genes, act = torch.randn(env.num_envs, GENES, generator=rng), acting(env, policy, self.upper_actions)
-        rest, group = mirrored_pose(env, ()), self.group.cpu()
-        largest, champions = torch.full((env.num_envs,), -math.inf), genes
-        for generation in tqdm(range(self.generations), desc="search", unit="generation", leave=False, disable=None):
-            tally = self.excite(env, act, genes, rest)
-            champions = best_of(genes, tally.worth, group)
-            largest = torch.maximum(largest, tally.most)
-            spread = _EXPLORED * (1.0 - 0.8 * generation / self.generations)
-            genes = next_generation(genes, tally.worth, group, rng, spread)
-        poses = 0.5 * random_poses(env.spec, env.num_envs, rng).flatten(1) + 0.5 * rest.cpu()
-        tally = self.excite(env, act, champions, poses.to(env.device))
+        act, groups = acting(env, policy, self.upper_actions), len(self.compared) * len(COMMANDS)
+        poses = random_poses(env.spec, -(-env.num_envs // groups), rng).flatten(1).to(env.device)
+        rest = mirrored_pose(env, ())
+        # All laws and commands have the same poses.
+        pose = torch.lerp(rest, poses, 0.5)[torch.arange(env.num_envs, device=env.device) // groups]
+        settled = self.settle(env, act, pose)
+        genes = torch.randn(env.num_envs, GENES, generator=rng)
+        best, tally = genes, self.excite(env, act, genes, settled)
+        for _ in tqdm(range(1, self.generations), desc="search", unit="generation", leave=False, disable=None):
+            genes = next_generation(best, tally.worth, self.group.cpu(), rng)
+            tried = self.excite(env, act, genes, settled)
+            best = torch.where((tried.worth > tally.worth).unsqueeze(1), genes, best)
+            tally = tally.or_better(tried)
         rows = {
             text: {
-                command: _row(tally, largest, group == law + len(self.compared) * way, self.seed)
+                command: _row(tally, (self.group == law + len(self.compared) * way).cpu(), self.seed)
                 for way, command in enumerate(COMMANDS)
             }
             for law, text in enumerate(self.compared)
@@ -172,44 +181,51 @@ class Passivity(Stance):
         metrics = {f"{law}, {command}": row["drawn"] for law, r in rows.items() for command, row in r.items()}
         return {"num_falls": int(tally.fell.sum()), "rows": rows, "metrics": metrics}
 
-    def excite(self, env: HumanoidEnv, act: PolicyFunction, genes: torch.Tensor, pose: torch.Tensor) -> Tally:
-        """Let an exciter loose on every left hand, arms at `pose` (U,) or (N, U).
+    def settle(self, env: HumanoidEnv, act: PolicyFunction, pose: torch.Tensor) -> dict[str, Any]:
+        """The environment's state once hands at the mean stiffness have come to rest, arms at `pose` (U,) or (N, U)."""
+        env.motions.hold(pose)
+        obs = env.reset()
+        env.forces.scripted.amplitude_h[:, 0] = 0.0
+        env.upper_body.parameters.stiffness = torch.full_like(env.upper_body.parameters.stiffness, self._mean)
+        for _ in range(round(self.settle_seconds / env.dt)):
+            obs, *_ = env.step(act(as_dict(obs, env.device)))
+        return env.state_dict()
+
+    def excite(self, env: HumanoidEnv, act: PolicyFunction, genes: torch.Tensor, settled: dict[str, Any]) -> Tally:
+        """Let an exciter loose on every left hand, from a state that `settle` returned.
 
         With a fixed pelvis, the work that counts is that in the world, otherwise that against the torso.
         """
-        env.motions.hold(pose)
-        obs = env.reset()
+        env.load_state_dict(settled)
+        obs = env.get_observations()
         limits = Limits(self.force_size, self.brake, self.stiffness_range, self.episode_seconds)
         way, arms = self.group // len(self.compared), len(env.spec.arms)
-        tally, frames, exciters = Tally.empty(env.num_envs, env.device), [], None
-        settle = round(self.settle_seconds / env.dt)
-        stiffness = torch.full((env.num_envs,), math.sqrt(math.prod(self.stiffness_range)), device=env.device)
-        for step in range(settle + round(self.episode_seconds / env.dt)):
+        exciters = Exciters(genes.to(env.device), way, self._natural(env), limits, self.seed)
+        tally, frames, first_alpha = Tally.empty(env.num_envs, env.device), [], env.upper_body.parameters.alpha
+        for step in range(round(self.episode_seconds / env.dt)):
             offset_h, velocity_h = _hand(env)
-            if step == settle:
-                exciters = Exciters(genes.to(env.device), way, self._natural(env), limits, self.seed)
-            if exciters:
-                time = (step - settle) * env.dt
-                stiffness = exciters.stiffness(time, offset_h, velocity_h)
-                env.forces.scripted.amplitude_h[:, 0] = exciters.force(time, velocity_h)
-            else:
-                env.forces.scripted.amplitude_h[:, 0] = 0.0
-            env.upper_body.parameters.stiffness = stiffness[:, None, None].expand(-1, arms, 3).clone()
+            stiffness, alpha = exciters.command(step * env.dt, offset_h, velocity_h)
+            env.forces.scripted.amplitude_h[:, 0] = exciters.force(step * env.dt, velocity_h)
+            env.upper_body.parameters.stiffness = stiffness.unsqueeze(1).repeat(1, arms, 1)
+            env.upper_body.parameters.alpha = alpha.unsqueeze(1) * first_alpha
             before = env.state
             obs, _, _, extras = env.step(act(as_dict(obs, env.device)))
             frames.append(picture_row(env))
-            if exciters:
-                tally.add(_work(env, before), extras["falls"], env.upper_body.report.get("store_energy"))
+            tally.add(_work(env, before), extras["falls"], env.upper_body.report.get("store_energy"))
         self.film = torch.stack(frames).cpu()
         return tally.finished(diverged=env.cfg.fixed_base)
+
+    @property
+    def _mean(self) -> float:
+        """The mean stiffness [N/m]."""
+        return math.sqrt(math.prod(self.stiffness_range))
 
     def _natural(self, env: HumanoidEnv) -> torch.Tensor:
         """Natural angular frequency (N,) [rad/s] of the left hand at the mean stiffness, mean over directions."""
         arms, pose = env.upper_body.arms, env.state.arms
         jacobian = arms.chains.jacobian(pose)[:, 0]
         mobility = jacobian @ torch.linalg.solve(joint_inertia(arms.inertias, pose)[:, 0], jacobian.transpose(1, 2))
-        mean = math.sqrt(math.prod(self.stiffness_range))
-        return (mean * mobility.diagonal(dim1=1, dim2=2).mean(1)).sqrt()
+        return (self._mean * mobility.diagonal(dim1=1, dim2=2).mean(1)).sqrt()
 
     def table(self, result: dict[str, Any]) -> str:
         """Energy drawn, law by law and command by command, as Markdown."""
@@ -238,11 +254,10 @@ def _work(env: HumanoidEnv, before: RobotState) -> torch.Tensor:
     return (env.hand_force_w[:, 0] * moved_w).sum(1)
 
 
-def _row(tally: Tally, largest: torch.Tensor, mine: torch.Tensor, seed: int) -> dict[str, Any]:
-    """One law under one command, in the envs of `mine` (N,): drawn at many poses, and the `largest` (N,) of all [J]."""
+def _row(tally: Tally, mine: torch.Tensor, seed: int) -> dict[str, Any]:
+    """One law under one command, in the envs of `mine` (N,): what the best exciters draw at their poses."""
     drawn, store = tally.most[mine], tally.store[mine]
-    found = torch.cat((drawn, largest[mine]))
-    found = found[found.isfinite()]
+    found = drawn[drawn.isfinite()]
     return {
         "drawn": summarize(drawn, seed),
         "largest": float(found.max()) if len(found) else None,
