@@ -41,23 +41,25 @@ from reports.law_figures import draw_properties, draw_static, draw_transient
 from reports.paper.tables import PROPERTIES, STATIC
 
 LOADS_N = (10.0, 30.0, 50.0)
+COTAP: dict[str, Any] = {"method": "cotap", "alpha": 1.0, "error": "joint", "damping": "critical"}
+TASK, DAMPED_AS_PD = {"error": "task"}, {"damping": "pd"}
 ROWS: dict[str, dict[str, Any]] = {
     "pd": {"method": "pd"},
     "soft-pd": {"method": "soft-pd"},
-    "cotap, joint error": {"method": "cotap"},
-    "cotap, task error": {"method": "cotap", "error": "task"},
-    "cotap, joint error, PD's damping": {"method": "cotap", "damping": "pd"},
-    "cotap, task error, PD's damping": {"method": "cotap", "error": "task", "damping": "pd"},
+    "cotap, joint error": COTAP,
+    "cotap, task error": COTAP | TASK,
+    "cotap, joint error, PD's damping": COTAP | DAMPED_AS_PD,
+    "cotap, task error, PD's damping": COTAP | TASK | DAMPED_AS_PD,
     "facet": {"method": "facet"},
-    "cotap+facet, joint error": {"method": "cotap+facet"},
-    "cotap+facet, task error": {"method": "cotap+facet", "error": "task"},
-    "cotap+facet-matched, joint error": {"method": "cotap+facet-matched"},
-    "cotap+facet-matched, task error": {"method": "cotap+facet-matched", "error": "task"},
+    "cotap+facet, joint error": COTAP | {"method": "cotap+facet"},
+    "cotap+facet, task error": COTAP | {"method": "cotap+facet"} | TASK,
+    "cotap+facet-matched, joint error": COTAP | {"method": "cotap+facet-matched"},
+    "cotap+facet-matched, task error": COTAP | {"method": "cotap+facet-matched"} | TASK,
     "hmc, alpha 0.5": {"method": "hmc", "alpha": 0.5},
-    "hmc, alpha 1": {"method": "hmc"},
+    "hmc, alpha 1": {"method": "hmc", "alpha": 1.0},
     "dcc": {"method": "dcc"},
 }
-"""Laws by the name of their row."""
+"""Laws by the name of their row: what it says holds whatever the policy was trained with."""
 AT_REST = tuple(name for name in ROWS if "damping" not in name)
 """Rows that differ at rest."""
 STRUCK = (
@@ -77,10 +79,10 @@ def laws_of(name: str, stiffness: float, null_stiffness: float, sensing: str = "
 class Static:
     """Downward displacement of the left hand under 10, 30 and 50 N downward, every law (paper, Table VI)."""
 
-    checkpoint: str = ""
-    """Policy (pelvis free); by default the shipped CoTaP policy, or else the base."""
+    checkpoint: str = Options.checkpoint
+    """Policy (pelvis free): a file, or a shipped policy's name."""
     facet_checkpoint: str = ""
-    """Policy of the row facet; by default as the others."""
+    """Policy of the row facet, which else has that of the others."""
     pelvis: str = "free"
     """free or fixed."""
     stiffness: float = 500.0
@@ -177,10 +179,10 @@ def policy_of(options: Static | Transient, name: str) -> str:
 class Transient:
     """What a hand does after a push on it, every law (paper, Fig. 9): error over time, energy of its oscillation."""
 
-    checkpoint: str = ""
-    """Policy; by default the shipped CoTaP policy, or else the base."""
+    checkpoint: str = Options.checkpoint
+    """Policy: a file, or a shipped policy's name."""
     facet_checkpoint: str = ""
-    """Policy of the row facet; by default as the others."""
+    """Policy of the row facet, which else has that of the others."""
     forces: tuple[float, ...] = (200.0, 500.0)
     """Along x on the left hand, for 50 ms [N]. The smaller leaves arms under PD and CoTaP below their torque limits."""
     stiffness: float = 500.0

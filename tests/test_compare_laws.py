@@ -9,6 +9,9 @@ import pytest
 import torch
 from random_policy import save_random_policy
 
+from cotap.compliance.laws import LawConfig, reads
+from cotap.envs.upper_body import UpperBodyConfig
+from cotap.evaluation.policy import find_checkpoint, load_policy
 from cotap.evaluation.wrong_model import misjudged_arms
 from cotap.robots.chains import arm_model
 from reports import compare_laws
@@ -31,6 +34,40 @@ def test_a_wrong_model_is_longer_and_heavier(spec):
 def policy(tmp_path_factory) -> list[str]:
     """Some policy: with a fixed pelvis it is not asked."""
     return ["--checkpoint", str(save_random_policy(tmp_path_factory.mktemp("policy") / "policy.pt"))]
+
+
+@pytest.mark.parametrize("table", ["static", "transient"])
+def test_without_a_checkpoint_the_shipped_policy_is_measured(table, tmp_path, monkeypatch):
+    class Asked(Exception):
+        pass
+
+    def run(protocol, options):
+        raise Asked(protocol, options.checkpoint, load_policy(find_checkpoint(options.checkpoint)).stage)
+
+    monkeypatch.setattr(compare_laws, "run", run)
+    with pytest.raises(Asked) as asked:
+        compare_laws.main([table, "--output", str(tmp_path)])
+    protocol = {"static": "static-stiffness", "transient": "impact"}[table]
+    assert asked.value.args == (protocol, "h1-cotap", "distill")
+
+
+@pytest.mark.parametrize("table", [compare_laws.Static, compare_laws.Transient])
+def test_facet_alone_has_a_policy_of_its_own(table):
+    options = table(checkpoint="a.pt", facet_checkpoint="b.pt")
+    others = {compare_laws.policy_of(options, name) for name in options.laws if name != "facet"}
+    assert (compare_laws.policy_of(options, "facet"), others) == ("b.pt", {"a.pt"})
+    assert compare_laws.policy_of(table(checkpoint="a.pt"), "facet") == "a.pt"
+
+
+def test_rows_are_what_they_are_called_whatever_the_policy_was_trained_with():
+    other = LawConfig("cotap", alpha=0.4, error="task", damping="pd")
+    for name in compare_laws.ROWS:
+        arms = compare_laws.laws_of(name, 500.0, 25.0).configure(UpperBodyConfig(other, other))
+        if reads(arms.left.name, "error"):
+            assert arms.left.error == ("task" if "task error" in name else "joint"), name
+            assert arms.left.damping == ("pd" if "PD's damping" in name else "critical"), name
+        if reads(arms.left.name, "alpha"):
+            assert arms.left.alpha == (0.5 if "alpha 0.5" in name else 1.0), name
 
 
 def small(table: str, folder: Path, *options: str) -> dict:
