@@ -7,7 +7,7 @@ import torch
 from cotap.evaluation.recording import EVENTS, SCENE, TRAJECTORY, Recording
 from cotap.evaluation.rollout import Trajectory
 
-SIZES = {"T": 6, "N": 2, "U": 8, "H": 2, "F": 2, "Q": 26}
+SIZES = {"T": 6, "N": 2, "U": 8, "J": 19, "H": 2, "F": 2, "Q": 26}
 
 
 def small_recording() -> Recording:

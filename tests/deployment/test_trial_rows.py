@@ -75,6 +75,10 @@ def test_rows_are_of_the_state_after_the_step_and_along_the_heading(policy, spec
         hand, body = now.site("left_hand").xpos, model.body(spec.arms[0].hand_body).id
         mujoco.mj_applyFT(model, now, turn.T @ load, np.zeros(3), hand, body, felt)
         np.testing.assert_allclose(row["arm_static_torque"][0], (now.qfrc_bias - felt)[6 + 11 :], atol=1e-5)
+        share = row["torque_share"][0].numpy() * [joint.torque_limit_nm for joint in spec.joints]
+        np.testing.assert_allclose(share[11:], row["arm_torque"][0].abs(), atol=1e-9)
+        assert share.shape == (19,)
+        assert share[:11].any()
         assert now.body(torso).xmat[8] < 0.995
         assert np.abs(off_w).max() > 0.01
 

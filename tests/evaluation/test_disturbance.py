@@ -9,6 +9,7 @@ import pytest
 import torch
 from test_metrics import trajectory
 
+from cotap.compare import compare
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.actions import ActionConfig
 from cotap.evaluate import main
@@ -26,6 +27,7 @@ from cotap.evaluation.disturbance import (
 from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.protocol import mirrored_pose
 from cotap.evaluation.rollout import acting, idle, record_rollout
+from cotap.evaluation.velocity_tracking import VelocityTracking
 
 LEFT, RIGHT, BOTH = [0], [1], [0, 1]
 
@@ -41,11 +43,12 @@ def test_measures_by_hand():
     t.arm_torque[inside, 0, 0], t.arm_torque[inside, 0, 1] = 3.0, -4.0
     t.arm_velocity[inside, 0, :2] = 0.5
     t.arm_error[inside, 0, 2] = 0.25
-    t.arm_torque_share[60:80, 0, :2] = 0.95
-    t.arm_torque_share[60:70, 0, 5] = 1.0
+    t.torque_share[60:80, 0, :2] = 0.95  # of a leg
+    t.torque_share[50:55, 0, 3] = 1.0  # of a leg, which is no arm at its limit
+    t.torque_share[60:70, 0, 11 + 5] = 1.0  # of an arm
     m = window_measures(t, 50, 100, LEFT)
     expected = {"e_torso": 0.5, "e_ee": 0.15, "e_ee_hit": 0.2, "j_upper": 5.0, "e_upper": 0.25, "peak_torque": 4.0,
-                "share_at_limit": 0.2, "near_limit_share": (20 * 2 + 10) / (50 * 8), "energy": 3.5,
+                "share_at_limit": 0.2, "near_limit_share": (20 * 2 + 5 + 10) / (50 * 19), "energy": 3.5,
                 "fall_fraction": 0.0}  # fmt: skip
     for name, value in expected.items():
         assert float(m[name][0]) == pytest.approx(value, abs=1e-5), name
@@ -151,6 +154,22 @@ def test_the_raw_reference_takes_the_upper_agents_place(make_env, robot, mode):
     upper = env.action_slices["upper"]
     torch.testing.assert_close(env.actuation.current[:, upper], env.motions.current().position)
     assert (acting(env, lambda _: torch.full((2, env.num_actions), 5.0), "policy")({})[:, upper] == 5.0).all()
+
+
+@pytest.mark.parametrize("mode", ["residual", "absolute"])
+def test_a_share_of_the_upper_agents_actions_goes_that_share_of_the_way(make_env, robot, mode):
+    """Joint targets lie between the raw reference's and the policy's own; so do those of the legs' own actions."""
+    targets = []
+    for upper_actions in ("reference", "0", "0.25", "1.0", "policy"):
+        env = make_env(2, robot=robot, actions=ActionConfig(upper_mode=mode))
+        env.motions.hold(env.motions.default + 0.1)
+        env.step(acting(env, lambda _, env=env: torch.full((2, env.num_actions), 0.5), upper_actions)({}))
+        targets.append(env.actuation.current)
+    raw, none, quarter, whole, own = targets
+    assert torch.equal(raw, none)
+    assert torch.equal(whole, own)
+    torch.testing.assert_close(quarter, raw + 0.25 * (own - raw))
+    assert ((own - raw)[:, env.action_slices["upper"]].abs() > 0.01).all()
 
 
 def test_arms_hold_a_pose_of_as_many_joints_as_they_have(make_env, robot):
@@ -302,6 +321,23 @@ def test_the_blow_itself_is_the_first_tenth_of_a_second():
     assert m["j_upper"]["mean"] == pytest.approx(3.0)
 
 
+@pytest.mark.parametrize("per_env", [True, False])
+def test_two_evaluations_of_velocity_tracking_compare_env_by_env(per_env):
+    """Arms 0.1 and 0.9 rad off before, half of that after: the mean of the pairs' differences, -0.25, is in doubt by
+    their spread alone."""
+    protocol, results = VelocityTracking(num_envs=2, episode_seconds=6.0, per_env=per_env), []
+    env = HumanoidEnv(protocol.configure(HumanoidEnvConfig(num_threads=1)))
+    for factor in (1.0, 0.5):
+        t = trajectory(steps=300, envs=2)
+        t.arm_error[:, :, 0] = factor * torch.tensor([0.1, 0.9])
+        results.append(protocol.measure(t, env) | {"protocol": "velocity-tracking", "settings": {"seed": 0}})
+    assert ("per_env" in results[0]) == per_env
+    found = compare(*results)["differences"]["e_upper"]
+    assert found["difference"] == pytest.approx(-0.25)
+    assert found.get("pairs") == (2 if per_env else None)
+    assert found["ci95"] == (pytest.approx([-0.45, -0.05]) if per_env else pytest.approx([-0.69, 0.20], abs=0.02))
+
+
 def test_every_envs_figures_are_those_behind_the_means():
     protocol = Impact(num_envs=3, per_env=True)
     t = trajectory(steps=200, envs=3)
@@ -333,6 +369,8 @@ def test_every_envs_figures_are_those_behind_the_means():
         (["--motion", "none", "--arm-pose", "0", "0", "0"], "arm_pose must have 4 numbers"),
         (["--arm-pose", "0", "0", "0", "0"], "held only with motion 'none'"),
         (["--upper-actions", "nobody"], "upper_actions 'nobody' is unknown"),
+        (["--upper-actions", "1.1"], "upper_actions must lie in [0.0, 1.0]"),
+        (["--upper-actions", "nan"], "upper_actions must"),
         (["--library", "nowhere.npz"], "nowhere.npz"),
         (["--checkpoint", "cotap-gaols"], "'cotap-gaols' does not exist"),
         (["--force", "nan", "0", "0"], "force.force[0]"),

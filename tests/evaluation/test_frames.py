@@ -99,6 +99,17 @@ def test_the_torque_that_statics_asks_of_the_arms_is_gravitys_less_the_loads(tur
         assert np.abs(felt[6 + env.num_lower :]).max() > 1.0
 
 
+def test_torques_are_recorded_as_shares_of_every_joint_s_limit(turning):
+    """Legs, waist and arms, in the order of the joints."""
+    env, row = turning
+    limit = torch.tensor([env.spec.joint(name).torque_limit_nm for name in env.spec.joint_names])
+    torch.testing.assert_close(row["torque_share"] * limit, env.torque.abs())
+    assert (row["torque_share"][:, : env.num_lower] > 0.0).any()
+    assert row["torque_share"].max() <= 1.0
+    torch.testing.assert_close(row["torque_share"][:, env.num_lower :] * limit[env.num_lower :],
+                               row["arm_torque"].abs())  # fmt: skip
+
+
 @pytest.mark.parametrize("lean", [0.4, -0.3])
 def test_a_loaded_hand_moves_along_the_heading_of_a_torso_that_leans(lean):
     """A waist that bends tilts the torso though the pelvis is held: the load is vertical, and so is what it does."""

@@ -38,7 +38,7 @@ def trajectory(steps: int = 200, envs: int = 2, **changes: torch.Tensor) -> Traj
         "arm_error": torch.zeros(steps, envs, 8),
         "arm_velocity": torch.zeros(steps, envs, 8),
         "arm_torque": torch.zeros(steps, envs, 8),
-        "arm_torque_share": torch.zeros(steps, envs, 8),
+        "torque_share": torch.zeros(steps, envs, 19),
         "arm_static_torque": torch.zeros(steps, envs, 8),
         "hand_offset": torch.zeros(steps, envs, 2, 3),
         "hand_error": torch.zeros(steps, envs, 2),

@@ -125,7 +125,6 @@ def _row(
     torque = torch.from_numpy(robot.torque()).unsqueeze(0)
     offset_t = s.arms.tip - controller.arm_pose(reference).tip
     force_w = torch.from_numpy(force_h).unsqueeze(0) @ s.heading_w.transpose(1, 2)
-    limit = torch.from_numpy(robot.torque_limit)[first:]
     return {
         "velocity": torch.cat((s.torso_linear_velocity_h[:, :2], s.yaw_rate.unsqueeze(1)), 1),
         "command": asked.asked_velocity.clone(),
@@ -136,7 +135,7 @@ def _row(
         "arm_error": s.joint_pos[:, first:] - reference,
         "arm_velocity": s.joint_vel[:, first:],
         "arm_torque": torque[:, first:],
-        "arm_torque_share": torque[:, first:].abs() / limit,
+        "torque_share": torque.abs() / torch.from_numpy(robot.torque_limit),
         "arm_static_torque": arm_static_torque(controller.upper_body.arms, s, force_w),
         "hand_offset": offset_t @ s.torso_to_heading.transpose(1, 2),
         "hand_error": offset_t.norm(dim=2),

@@ -204,12 +204,13 @@ def window_measures(t: Trajectory, begin: int, end: int, hit: list[int]) -> dict
 
     Hand errors are against the reference carried in the torso frame; `e_ee_hit` is that of the hands in `hit`. Torques
     are those at the ends of control steps, `peak_torque` the largest of any arm joint, `energy` the integral of
-    |torque x rate| over all arm joints.
+    |torque x rate| over all arm joints, `near_limit_share` the share of all joints, the legs' too, near their limit.
     """
     part = replace(t, **{f.name: getattr(t, f.name)[begin:end] for f in fields(t) if f.name != "dt"})
     alive = t.alive()[begin:end]
     torque = part.arm_torque.norm(dim=2)
     power = (part.arm_torque * part.arm_velocity).abs().sum(2)
+    arm_share = part.torque_share[..., -part.arm_torque.shape[2] :]
     error = (part.velocity - part.command)[..., :2]
     seen = alive.any(0)
     nothing = torch.full(seen.shape, math.nan)
@@ -223,8 +224,8 @@ def window_measures(t: Trajectory, begin: int, end: int, hit: list[int]) -> dict
         "j_upper": masked_mean(torque, alive),
         "e_upper": masked_mean(part.arm_error.norm(dim=2), alive),
         "peak_torque": torch.where(seen, peak, nothing),
-        "share_at_limit": masked_mean((part.arm_torque_share > 0.999).any(2).float(), alive),
-        "near_limit_share": masked_mean((part.arm_torque_share > NEAR_LIMIT).float().mean(2), alive),
+        "share_at_limit": masked_mean((arm_share > 0.999).any(2).float(), alive),
+        "near_limit_share": masked_mean((part.torque_share > NEAR_LIMIT).float().mean(2), alive),
         "energy": torch.where(seen, energy, nothing),
         "fall_fraction": t.fell[:end].any(0),
     }

@@ -54,8 +54,8 @@ class Fidelity(HeldLoad):
     pelvis: str = "free"
     """free, or fixed in the air, without a policy."""
     upper_actions: str = "policy"
-    """What moves the arms: policy or reference. reference leaves out the policy's own arm actions. With --pelvis free
-    alone."""
+    """What moves the arms: policy or reference. reference leaves out the policy's own arm actions; a number from 0 to 1
+    is the share of them that is left. With --pelvis free alone."""
     settle_seconds: float = 6.0
     """Time to settle, without the load and again with it [s]. The last second of each is measured."""
 

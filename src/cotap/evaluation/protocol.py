@@ -10,13 +10,13 @@ from typing import Any, ClassVar
 
 import torch
 
-from cotap.checks import require_one_of, require_positive_int, require_range, require_seed
+from cotap.checks import require_positive_int, require_range, require_seed
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.randomization import RandomizationConfig
 from cotap.envs.terminations import TerminationConfig
 from cotap.evaluation import report
 from cotap.evaluation.law_options import LawOptions
-from cotap.evaluation.rollout import UPPER_ACTIONS, PolicyFunction, Trajectory, acting, record_rollout
+from cotap.evaluation.rollout import PolicyFunction, Trajectory, acting, record_rollout, upper_share
 from cotap.evaluation.undisturbed import disable_disturbances
 from cotap.motions.reference import HELD, MIXTURE, ClipConfig
 
@@ -106,12 +106,13 @@ class RolloutProtocol(Protocol):
     library: str = ""
     """Motion library (.npz) of the clips. By default that of the policy."""
     upper_actions: str = "policy"
-    """What moves the arms: policy or reference. reference leaves out the policy's own arm actions."""
+    """What moves the arms: policy or reference. reference leaves out the policy's own arm actions; a number from 0 to 1
+    is the share of them that is left."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
         super().check()
-        require_one_of("upper_actions", self.upper_actions, UPPER_ACTIONS)
+        upper_share(self.upper_actions)
         if not self.motion:
             raise ValueError(f"motion must name clips, {MIXTURE!r} or {HELD!r}, got nothing")
         if len(self.motion) > 1 and not {MIXTURE, HELD}.isdisjoint(self.motion):

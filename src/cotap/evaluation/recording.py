@@ -18,7 +18,7 @@ from cotap.evaluation.rollout import STEPPED, Trajectory
 from cotap.files import write_arrays
 from cotap.inputs import InputError, read_arrays
 
-FORMAT, VERSION = "cotap-recording", 4
+FORMAT, VERSION = "cotap-recording", 5
 SCENE: dict[str, tuple[str | int, ...]] = {
     "qpos": ("Q",), "hand_w": ("H", 3), "hand_reference_w": ("H", 3), "hand_force_w": ("H", 3), "heading_w": (3, 3),
     "commanded_stiffness": ("H", 3), "effective_stiffness": ("H", 3, 3), "stiffness_eigenvalues": ("H", 2),
@@ -29,7 +29,7 @@ OF_SOME_LAWS = ("commanded_stiffness", "store_energy", "held_back")
 """Of these, what only some laws have; NaN under the others."""
 TRAJECTORY: dict[str, tuple[str | int, ...]] = {
     "velocity": (3,), "command": (3,), "stand": (), "height": (), "height_command": (),
-    "position": (2,), "arm_error": ("U",), "arm_velocity": ("U",), "arm_torque": ("U",), "arm_torque_share": ("U",),
+    "position": (2,), "arm_error": ("U",), "arm_velocity": ("U",), "arm_torque": ("U",), "torque_share": ("J",),
     "arm_static_torque": ("U",), "hand_offset": ("H", 3), "hand_error": ("H",), "foot_contact": ("F",),
     "foot_speed": ("F",), "foot_height": ("F",), "path_error": (), "fell": (),
 }  # fmt: skip

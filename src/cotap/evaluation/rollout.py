@@ -10,6 +10,7 @@ import torch
 from tqdm import tqdm
 
 from cotap.agents.actors import as_dict
+from cotap.checks import quoted, require_range
 from cotap.compliance.dynamics import gravity_torque
 from cotap.compliance.interface import Arms
 from cotap.envs import HumanoidEnv
@@ -44,8 +45,8 @@ class Trajectory:
     """(T, N, U) arm joint rates [rad/s]."""
     arm_torque: torch.Tensor
     """(T, N, U) [Nm]."""
-    arm_torque_share: torch.Tensor
-    """(T, N, U) size of that torque over the joint's limit."""
+    torque_share: torch.Tensor
+    """(T, N, J) size of every joint's torque over its limit, the arms' last."""
     arm_static_torque: torch.Tensor
     """(T, N, U) what statics asks of the arms: nominal gravity at this pose, less what the hand's force does [Nm]."""
     hand_offset: torch.Tensor
@@ -128,15 +129,36 @@ def reference_actions(env: HumanoidEnv) -> torch.Tensor:
     return torch.cat(((reference - targets.default[upper]) / targets.scale[upper], laws), 1)
 
 
+def upper_share(upper_actions: str) -> float:
+    """The share of the policy's own arm actions that acts: 1 for `policy`, 0 for `reference`, or a number between.
+
+    Raises:
+        ValueError: it is neither.
+    """
+    if upper_actions in UPPER_ACTIONS:
+        return float(upper_actions == "policy")
+    try:
+        share = float(upper_actions)
+    except ValueError as error:
+        known = f"{', '.join(UPPER_ACTIONS)} or a share from 0 to 1"
+        raise ValueError(f"upper_actions {quoted(upper_actions)} is unknown; known: {known}") from error
+    return require_range("upper_actions", share, 0.0, 1.0)
+
+
 def acting(env: HumanoidEnv, policy: PolicyFunction, upper_actions: str) -> PolicyFunction:
-    """`policy` as it is, or with the arms' raw reference in place of its upper actions; see `UPPER_ACTIONS`. A robot
+    """`policy` as it is, or with that `upper_share` of what its upper actions add to the arms' raw reference. A robot
     whose base is held has no policy."""
     if env.cfg.fixed_base:
         return idle(env)
-    if upper_actions == "policy":
+    share = upper_share(upper_actions)
+    if share == 1.0:
         return policy
-    lower = env.action_slices["lower"]
-    return lambda observations: torch.cat((policy(observations)[:, lower], reference_actions(env)), 1)
+
+    def act(observations: dict[str, torch.Tensor]) -> torch.Tensor:
+        lower, upper = policy(observations).split([env.num_lower, env.num_actions - env.num_lower], 1)
+        return torch.cat((lower, torch.lerp(reference_actions(env), upper, share)), 1)
+
+    return act
 
 
 def idle(env: HumanoidEnv) -> PolicyFunction:
@@ -167,7 +189,7 @@ def trajectory_row(env: HumanoidEnv, fell: torch.Tensor) -> dict[str, torch.Tens
         "arm_error": s.joint_pos[:, upper] - r.reference.position,
         "arm_velocity": s.joint_vel[:, upper],
         "arm_torque": r.torque[:, upper],
-        "arm_torque_share": r.torque[:, upper].abs() / env.arm_limits.flatten(),
+        "torque_share": r.torque.abs() / env.actuation.torque_limit,
         "arm_static_torque": arm_static_torque(env.upper_body.arms, s, env.hand_force_w),
         "hand_offset": offset_t @ s.torso_to_heading.transpose(1, 2),
         "hand_error": offset_t.norm(dim=2),

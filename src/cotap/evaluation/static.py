@@ -17,7 +17,7 @@ from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.scripted_forces import ForceProfile
 from cotap.evaluation.protocol import mirrored_pose, require_pose
 from cotap.evaluation.report import heading, pyplot, save_figure
-from cotap.evaluation.rollout import UPPER_ACTIONS, PolicyFunction, acting, picture_row
+from cotap.evaluation.rollout import PolicyFunction, acting, picture_row, upper_share
 from cotap.evaluation.scenario import Stance
 
 
@@ -32,8 +32,8 @@ class HeldLoad(Stance):
     pelvis: str = "fixed"
     """free, or fixed in the air, without a policy."""
     upper_actions: str = "reference"
-    """What moves the arms: policy or reference. reference leaves out the policy's own arm actions. With --pelvis free
-    alone."""
+    """What moves the arms: policy or reference. reference leaves out the policy's own arm actions; a number from 0 to 1
+    is the share of them that is left. With --pelvis free alone."""
     settle_seconds: float = 10.0
     """Time to settle, without the load and again with it [s]. The last second of each is measured."""
 
@@ -41,7 +41,7 @@ class HeldLoad(Stance):
         """Raise ValueError naming the first field that is out of its range."""
         super().check()
         require_one_of("hand", self.hand, ("left", "right"))
-        require_one_of("upper_actions", self.upper_actions, UPPER_ACTIONS)
+        upper_share(self.upper_actions)
         require_range("settle_seconds", self.settle_seconds, 2.0, 600.0)
 
     @property

@@ -12,6 +12,7 @@ import torch
 from cotap.checks import require_one_of, require_range
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.hand_loads import HandLoadConfig
+from cotap.evaluation.disturbance import per_env_figures
 from cotap.evaluation.metrics import summaries, tracking_measures, tracking_slopes
 from cotap.evaluation.protocol import RolloutProtocol
 from cotap.evaluation.report import plot_tracking
@@ -46,6 +47,8 @@ class VelocityTracking(RolloutProtocol):
     collision: str = ""
     """What collides: feet (with the floor) or full (all shapes). By default as in the training. With full, shapes also
     meet each other."""
+    per_env: bool = False
+    """Write the figures of every env as well. `cotap compare` then compares env by env."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
@@ -96,6 +99,7 @@ class VelocityTracking(RolloutProtocol):
             "metrics": metrics,
             "metrics_without_falls": summaries(measures, stood, self.seed),
             "window": {"start": 0.0, "end": self.episode_seconds},
+            **({"per_env": per_env_figures(measures, stood)} if self.per_env else {}),
         }
 
     def plot(self, path: Path, result: dict[str, Any]) -> None:
