@@ -177,22 +177,94 @@ def test_a_robot_of_29_joints_takes_clips_of_29(tmp_path: Path, spec):
     assert said == "clip 'made': dof_pos of h1 must have shape (T, 19), got (91, 29)"
 
 
-def test_clips_of_g1_come_with_wrists_and_without(tmp_path: Path):
+def test_clips_of_g1_come_with_wrists(tmp_path: Path):
     g1 = ROBOTS["g1"]()
     joints = np.linspace(0.02, 0.3, 29) * np.sin(times_of(30.0))[:, None]  # every joint is another
-    wrists = [i for i, joint in enumerate(g1.joints) if "wrist" in joint.name]
     upper = g1.indices(g1.upper_joints)
-    assert len(wrists) == 6
     (tmp_path / "all.pkl").write_bytes(pickle.dumps(gmr_clip(joints=joints)))
     np.testing.assert_allclose(imported(tmp_path / "all.pkl", g1).arms[::5], joints[::3, upper], atol=1e-6)
     rows = np.column_stack((np.zeros((91, 6)), np.ones(91), joints))
     np.savetxt(tmp_path / "all.csv", rows, delimiter=",")
     np.testing.assert_allclose(imported(tmp_path / "all.csv", g1).arms[::5], joints[::3, upper], atol=1e-6)
-    (tmp_path / "few.pkl").write_bytes(pickle.dumps(gmr_clip(joints=np.delete(joints, wrists, 1))))
-    joints[:, wrists] = 0.0
-    np.testing.assert_allclose(imported(tmp_path / "few.pkl", g1).arms[::5], joints[::3, upper], atol=1e-6)
     (tmp_path / "odd.pkl").write_bytes(pickle.dumps(gmr_clip(joints=joints[:, :22])))
     assert reason(tmp_path / "odd.pkl", g1) == "clip 'odd': dof_pos of g1 must have shape (T, 29), got (91, 22)"
+
+
+WITHOUT_WRISTS = [joint.name for joint in ROBOTS["g1"]().joints if "wrist" not in joint.name]
+OTHER_23 = [*WITHOUT_WRISTS[:13], *WITHOUT_WRISTS[15:19], "left_wrist_roll_joint", *WITHOUT_WRISTS[19:],
+            "right_wrist_roll_joint"]  # fmt: skip
+"""Joints of the G1 that has 23: a waist of one joint, and wrists that roll."""
+
+
+def g1_joints(names: list[str]) -> np.ndarray:
+    """(91, names): every joint of the G1 moves differently."""
+    joints = np.linspace(0.02, 0.3, 29) * np.sin(times_of(30.0) + 0.1)[:, None]
+    return joints[:, ROBOTS["g1"]().indices(names)]
+
+
+def pose_aa(names: list[str]) -> np.ndarray:
+    """(91, 1 + names + 3, 3) rotations of the root, the joints and three points, as PHC has them."""
+    axes = np.array([ROBOTS["g1"]().joint(name).axis for name in names])
+    turns = g1_joints(names)[:, :, None] * axes
+    return np.concatenate((np.full((91, 1, 3), 0.2), turns, np.zeros((91, 3, 3))), 1).astype(np.float32)
+
+
+def expected_arms(names: list[str]) -> np.ndarray:
+    """Joints that have no name rest at zero."""
+    g1 = ROBOTS["g1"]()
+    joints = np.zeros((91, 29))
+    joints[:, g1.indices(names)] = g1_joints(names)
+    return joints[::3, g1.indices(g1.upper_joints)]
+
+
+@pytest.mark.parametrize("key", ["joint_names", "dof_names"])
+@pytest.mark.parametrize("names", [WITHOUT_WRISTS, [joint.name for joint in ROBOTS["g1"]().joints]])
+def test_joints_go_by_name_in_any_order(tmp_path: Path, key: str, names: list[str]):
+    shuffled = [names[i] for i in np.random.default_rng(0).permutation(len(names))]
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps(gmr_clip(joints=g1_joints(shuffled)) | {key: shuffled}))
+    clip = imported(tmp_path / "a.pkl", ROBOTS["g1"]())
+    np.testing.assert_allclose(clip.arms[::5], expected_arms(names), atol=1e-6)
+
+
+def test_names_may_lack_their_suffix(tmp_path: Path):
+    short = np.array([name.removesuffix("_joint") for name in WITHOUT_WRISTS])
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps(gmr_clip(joints=g1_joints(WITHOUT_WRISTS)) | {"joint_names": short}))
+    clip = imported(tmp_path / "a.pkl", ROBOTS["g1"]())
+    np.testing.assert_allclose(clip.arms[::5], expected_arms(WITHOUT_WRISTS), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (OTHER_23, "joint_names lacks 'waist_roll'; g1 needs all but the wrists'"),
+        ([*WITHOUT_WRISTS[:-1], "tail_joint"], "joint_names must name joints of g1, each once, got 'tail'"),
+        ([*WITHOUT_WRISTS[:-1], WITHOUT_WRISTS[0]], "joint_names must name joints of g1, each once, got 'left_hip_p"),
+        (WITHOUT_WRISTS[:-1], "joint_names must be 23 names, one for each column, got ['left_hip_pitch_joint'"),
+        ([*WITHOUT_WRISTS[:-1], 3], "joint_names must be 23 names"),
+        ("left_hip_pitch_joint and so on", "joint_names must be 23 names"),
+    ],
+)
+def test_names_that_do_not_fit_are_refused(tmp_path: Path, names, message: str):
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps(gmr_clip(joints=g1_joints(WITHOUT_WRISTS)) | {"joint_names": names}))
+    assert message in reason(tmp_path / "a.pkl", ROBOTS["g1"]())
+
+
+def test_fewer_joints_without_names_are_known_by_their_axes(tmp_path: Path):
+    clip = gmr_clip(joints=g1_joints(WITHOUT_WRISTS)) | {"pose_aa": pose_aa(WITHOUT_WRISTS)}
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps(clip))
+    clip = imported(tmp_path / "a.pkl", ROBOTS["g1"]())
+    np.testing.assert_allclose(clip.arms[::5], expected_arms(WITHOUT_WRISTS), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "pose",
+    [None, pose_aa(OTHER_23), np.zeros((91, 27, 3)), pose_aa(WITHOUT_WRISTS)[:9], pose_aa(WITHOUT_WRISTS)[:, :9], "x"],
+)
+def test_fewer_joints_that_may_be_others_are_refused(tmp_path: Path, pose):
+    clip = gmr_clip(joints=g1_joints(WITHOUT_WRISTS)) | {"pose_aa": pose}
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps(clip))
+    said = reason(tmp_path / "a.pkl", ROBOTS["g1"]())
+    assert "has 23 columns, and neither joint_names nor the axes of pose_aa say" in said
 
 
 @pytest.mark.parametrize(

@@ -47,6 +47,10 @@ class _Entries:
 
 
 _PICKLED = (_Entries("dof", "root_trans_offset"), _Entries("dof_pos", "root_pos"))
+_ASIDE_RAD = 1e-3
+"""How far a joint of `pose_aa` may turn about another axis than its own."""
+_JOINT_NAMES = ("joint_names", "dof_names")
+"""Entries of pickles that tell which joints the angles are of."""
 _DEEPMIMIC_COLUMNS = 44
 _LAFAN_FPS = 30.0
 SLOWEST_FPS, FASTEST_FPS = 1.0, 10_000.0
@@ -71,10 +75,11 @@ def read_amass(path: Path, spec: RobotSpec, fps: float | None = None) -> Clips:
 
 
 def read_phc(path: Path, spec: RobotSpec, fps: float | None = None) -> Clips:
-    """Pickles of joint angles, by joblib or not: a dict of clips, or one clip; quaternions scalar last. All joints, or
-    all but the wrists', which then rest at zero.
+    """Pickles of joint angles, by joblib or not: a dict of clips, or one clip; quaternions scalar last.
 
     A clip is as PHC and human2humanoid have it (`dof`, `root_trans_offset`) or as GMR has it (`dof_pos`, `root_pos`).
+    Its joints are those that `joint_names` or `dof_names` says, else all in the robot's order. The wrists' may lack,
+    and then rest at zero: without names only if the axes of `pose_aa` are those of the other joints.
     """
     content = load_joblib(path)
     if not isinstance(content, dict) or not content:
@@ -291,22 +296,59 @@ def _pickled(name: str, clip: Any, spec: RobotSpec, fps: float | None) -> JointM
         raise MotionError(f"clip {quoted(name)} lacks {missing[0]!r}")
     angles = clip[entries.joints]
     angles = angles.squeeze() if isinstance(angles, np.ndarray) else angles
-    joints = _with_wrists(_numbers(name, f"{entries.joints} of {spec.name}", angles, at_least=1), spec)
-    joints = _numbers(name, f"{entries.joints} of {spec.name}", joints, len(spec.joints))
+    what = f"{entries.joints} of {spec.name}"
+    angles = _numbers(name, what, angles, at_least=1)
+    columns = _named_columns(name, clip, angles.shape[1], spec) or _assumed_columns(name, what, clip, angles, spec)
+    joints = np.zeros((len(angles), len(spec.joints)))
+    joints[:, columns] = angles
     position = _numbers(name, entries.position, clip[entries.position], 3)
     quaternion = _numbers(name, "root_rot", clip["root_rot"], 4)
     return _joint_motion(name, _rate(name, clip.get("fps"), fps), position, quaternion, joints, spec)
 
 
-def _with_wrists(joints: np.ndarray, spec: RobotSpec) -> np.ndarray:
-    """Angles (T, J) of joints that may lack the wrists', such as 23 of G1's 29; else `joints` as they are."""
+def _named_columns(name: str, clip: dict[Any, Any], count: int, spec: RobotSpec) -> list[int] | None:
+    """Which of the robot's joints each of `count` columns is of, by the clip's own names; None where it has none."""
+    key = next((key for key in _JOINT_NAMES if clip.get(key) is not None), None)
+    if key is None:
+        return None
+    given = clip[key]
+    names = list(given) if isinstance(given, (list, tuple, np.ndarray)) else []
+    if len(names) != count or not all(isinstance(joint, str) for joint in names):
+        raise MotionError(f"clip {quoted(name)}: {key} must be {count} names, one for each column, got {quoted(given)}")
+    places = {joint.name.removesuffix("_joint"): i for i, joint in enumerate(spec.joints)}
+    short = [joint.removesuffix("_joint") for joint in names]
+    odd = [joint for i, joint in enumerate(short) if joint not in places or joint in short[:i]]
+    if odd:
+        raise MotionError(
+            f"clip {quoted(name)}: {key} must name joints of {spec.name}, each once, got {quoted(odd[0])}"
+        )
+    wrists = {joint.removesuffix("_joint") for joint in wrist_joints(spec)}
+    if lacking := [joint for joint in places if joint not in wrists and joint not in short]:
+        raise MotionError(f"clip {quoted(name)}: {key} lacks {lacking[0]!r}; {spec.name} needs all but the wrists'")
+    return [places[joint] for joint in short]
+
+
+def _assumed_columns(name: str, what: str, clip: dict[Any, Any], angles: np.ndarray, spec: RobotSpec) -> list[int]:
+    """The same where the clip has no names: all joints in the robot's order, or all but the wrists' if the axes of its
+    `pose_aa` say so. Other joints may be as many: a G1 of 23 joints has one in the waist, and wrists that roll."""
     wrists = set(wrist_joints(spec))
     others = [i for i, joint in enumerate(spec.joints) if joint.name not in wrists]
-    if joints.shape[1] != len(others):
-        return joints
-    out = np.zeros((len(joints), len(spec.joints)))
-    out[:, others] = joints
-    return out
+    if angles.shape[1] != len(others) or not wrists:
+        _numbers(name, what, angles, len(spec.joints))
+        return list(range(len(spec.joints)))
+    pose = clip.get("pose_aa")
+    shape = np.shape(pose) if isinstance(pose, np.ndarray) and pose.dtype.kind == "f" else ()
+    if len(shape) == 3 and shape[0] == len(angles) and shape[1] > len(others) and shape[2] == 3:
+        turns = np.asarray(pose, dtype=float)[:, 1 : 1 + len(others)]  # the root's comes first
+        axes = np.array([spec.joints[i].axis for i in others])
+        aside = turns - (turns * axes).sum(-1, keepdims=True) * axes
+        arms = [k for k, i in enumerate(others) if spec.joints[i].name in spec.upper_joints]
+        if turns[:, arms].any() and np.abs(aside).max() < _ASIDE_RAD:
+            return others
+    raise MotionError(
+        f"clip {quoted(name)}: {what} has {len(others)} columns, and neither joint_names nor the axes of pose_aa say "
+        "that they are all but the wrists'; add joint_names"
+    )
 
 
 def _lafan(path: Path, spec: RobotSpec, fps: float | None) -> JointMotion:
