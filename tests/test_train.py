@@ -20,7 +20,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from cotap import __version__, pipeline, train
 from cotap.agents.checkpoint import load_checkpoint, save_checkpoint, sha256
 from cotap.agents.runner import sole_writer
-from cotap.configs import BASE_RECIPES, DISTILL_RECIPES, BaseTraining, from_plain, to_plain
+from cotap.configs import BASE_RECIPES, DISTILL_RECIPES, BaseTraining, from_plain
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.rewards import LowerRewards, UpperRewards
 from cotap.evaluation import policy
