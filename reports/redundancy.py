@@ -37,8 +37,8 @@ TABLES = {
     for mode in ("stance", "walking")
     for how in ("", BY_MASS)
 } | {
-    constant_load.MODE: Table(2 * (constant_load.MODE,), constant_load.CHANGING, constant_load.COMPLIANT),
-    periodic.MODE: Table(2 * (periodic.MODE,), tuple(periodic.CHANGING), (periodic.ARMS,)),
+    constant_load.MODE: Table((constant_load.MODE, constant_load.MODE), constant_load.CHANGING, constant_load.COMPLIANT),
+    periodic.MODE: Table((periodic.MODE, periodic.MODE), tuple(periodic.CHANGING), (periodic.ARMS,)),
 }  # fmt: skip
 """By title."""
 VERDICTS = ("more", "less", "cannot be distinguished", "not measured")
@@ -148,7 +148,7 @@ def causes(h1: dict[str, Any], g1: dict[str, Any]) -> list[str]:
                 content.get("rows", {}).get(key, {}).get("metrics_without_falls", {}).get(measure + suffix)
                 for content in (h1, g1)
             ]
-            found = verdict(*pair, "lower", "higher") if all(pair) else "not measured"
+            found = verdict(*pair, lower="lower", higher="higher") if all(pair) else "not measured"
             lines.append(row(name, title, *map(shown, pair), found))
     return lines
 
