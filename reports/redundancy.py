@@ -37,7 +37,9 @@ TABLES = {
     for mode in ("stance", "walking")
     for how in ("", BY_MASS)
 } | {
-    constant_load.MODE: Table((constant_load.MODE, constant_load.MODE), constant_load.CHANGING, constant_load.COMPLIANT),
+    constant_load.MODE: Table(
+        (constant_load.MODE, constant_load.MODE), constant_load.CHANGING, constant_load.COMPLIANT
+    ),
     periodic.MODE: Table((periodic.MODE, periodic.MODE), tuple(periodic.CHANGING), (periodic.ARMS,)),
 }  # fmt: skip
 """By title."""
