@@ -17,12 +17,14 @@ from reports.paper.ablation import ablation, samples
 from reports.paper.beyond import beyond
 from reports.paper.book import POLICIES, Book
 from reports.paper.constant_load import constant_load
+from reports.paper.facet import facet
 from reports.paper.fidelity import fidelity
 from reports.paper.field import field
 from reports.paper.impact import impact
 from reports.paper.observation import observation
 from reports.paper.periodic import periodic
 from reports.paper.pictures import pictures
+from reports.paper.sim_to_sim import sim_to_sim
 from reports.paper.tables import PAPER_ROBOT
 from reports.paper.tour import tour
 from reports.paper.walking import walking
@@ -32,9 +34,11 @@ PARTS: dict[str, Callable[[Book], None]] = {
     "load": constant_load,
     "ablation": ablation,
     "periodic": periodic,
+    "facet": facet,
     "observation": observation,
     "fidelity": fidelity,
     "walking": walking,
+    "sim-to-sim": sim_to_sim,
     "field": field,
     "beyond": beyond,
     "tour": tour,
@@ -53,9 +57,7 @@ Nm/rad, and alpha 1 unless it is named; where a stiffness stands by itself (*K_e
 k_null is that of the training. PD is plain PD with the CoTaP policy, which was trained under CoTaP alone, unless the
 base policy is named; the paper's PD is that of FALCON's policy. The paper measured H1 in Isaac Gym,
 with 4096 envs, and gives neither window nor torque limits: orderings and ratios compare, digits do not."""
-ELSEWHERE = (
-    "Its Table I is in [laws](laws/properties.md); `python -m reports.compare_laws` makes its Table VI and Fig. 9."
-)
+ELSEWHERE = "Its Table I is in [laws](laws/properties.md)."
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -130,13 +130,22 @@ def test_an_ablation_outside_the_trainings_is_marked(book, monkeypatch):
     monkeypatch.setattr(Book, "has", lambda _, policy: policy in values)
     monkeypatch.setattr(Book, "checkpoint", lambda *_: {"samples": 15_000_000})
     run = {name: measured(value, e_upper=2.0) for name, value in values.items()}
+    run["no-ratio"]["num_falls"] = 2
     monkeypatch.setattr(Book, "run", lambda _, __, policy, *___: run.get(policy))
     ablation.ablation(book)
-    rows = {line.split(" | ")[0][2:]: line.split(" | ")[1:4] for line in book.lines if line.startswith("| ")}
+    tables = "\n".join(book.lines).split("\n\n")
+    rows, falls = (
+        {line.split(" | ")[0][2:]: line.split(" | ")[1:4] for line in text.splitlines() if line.startswith("| ")}
+        for text in tables
+        if text.startswith("| what")
+    )
     assert rows["without the ratio"] == ["15.0", "**8.000 [7.900,8.100]**", "2.000 [1.900,2.100]"]
     assert rows["goals observed"][1] == "4.000 [3.900,4.100]"
     assert rows["CoTaP, three seeds"][1] == "2.000 (range 1.000 to 3.000; interval -2.968 to 6.968)"
     assert rows["CoTaP"][1] == "9.000 [8.900,9.100]"  # another training, not marked
+    assert falls["goals observed"] == ["12.5 [2.2,47.1]"] * 3  # as of each seed, of all 1 of 8
+    assert falls["CoTaP, three seeds"][0] == "12.5 (range 12.5 to 12.5; interval 12.5 to 12.5)"
+    assert falls["without the ratio"] == ["**25.0 [7.1,59.1]**"] * 3
     del values["seed-1"]
     book.lines.clear()
     ablation.ablation(book)
@@ -164,8 +173,67 @@ def test_the_relative_change_has_a_bootstrap_interval():
 def test_an_error_without_bound_is_the_largest():
     rows = [{"axis": "x", "error": -0.3, "ci95": [-0.4, -0.2], "n": 4}, {"axis": "x", "error": 0.1, "n": 4},
             {"axis": "y", "error": None, "n": 4}, {"axis": "z", "error": None, "n": 0}]  # fmt: skip
-    assert [fidelity.worst(rows, axis) for axis in "xyz"] == ["-30% [-40%,-20%]", "no bound", "(not measured)"]
-    assert fidelity.single_hands({"50": 0.021, "95": None}) == "2.1%, no bound"
+    assert [fidelity.worst(rows, axis) for axis in "xyz"] == ["-30.0% [-40.0%,-20.0%]", "no bound", "(not measured)"]
+    found = fidelity.single_hands({"50": 0.021, "95": None}, {"50": [0.01, 0.03], "95": [0.12, None]})
+    assert found == "2.1%, no bound [12.0%,no bound]"
+
+
+@pytest.mark.parametrize(
+    ("intervals", "found"),
+    [([[-0.05, 0.01], [0.0, 0.05]], "**yes**"), ([[-0.05, 0.01], [0.0, 0.06]], "cannot be told"),
+     ([[-0.07, -0.06], [0.0, 0.01]], "no"), ([[0.0, 0.01], [0.06, 0.07]], "no"), ([[0.0, 0.01], None], "no"),
+     ([], "(not measured)")],
+)  # fmt: skip
+def test_felt_stiffness_is_within_its_line_if_every_interval_is(intervals, found):
+    rows = [{"ci95": interval, "n": 4} for interval in intervals] + [{"ci95": None, "n": 0}]
+    assert fidelity.within(rows, 0.05) == found
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "word"),
+    [
+        (-0.3, -0.2, "holds"),
+        (-0.3, -0.19, "cannot be told"),
+        (-0.19, -0.1, "does not hold"),
+        (0.1, 0.3, "does not hold"),
+    ],
+)
+def test_better_by_a_fifth_is_a_whole_interval_below(low, high, word):
+    found = fidelity.verdict({"mean": (low + high) / 2.0, "ci95": [low, high], "n": 9})
+    assert found.startswith(f"**{word}**, ")
+    assert found.endswith(f"[{low:+.1%},{high:+.1%}]")
+
+
+def test_the_upper_agent_is_set_against_the_raw_reference_env_by_env(book, monkeypatch):
+    """With each further quarter of its actions arms are off by a tenth less, and single hands by 2 % more."""
+    asked = {}
+
+    def run(self, name, policy, protocol, *options, envs):
+        share = {"reference": 0.0}.get(options[-1]) if "--upper-actions" in options else 1.0
+        share = float(options[-1]) if share is None else share
+        asked[name] = policy, protocol, envs
+        e_upper = [0.2 * (1.0 - 0.4 * share) * factor for factor in (1.0, 2.0, 3.0)]
+        rows = [{"axis": axis, "error": 0.01, "ci95": [0.0, 0.02], "n": 4} for axis in "xyz"]
+        self.results[name] = measured(1.0) | {
+            "per_env": {"stood": [1.0] * 3, "e_upper": e_upper},
+            "metrics": {"e_upper": {"mean": sum(e_upper) / 3.0, "ci95": [0.0, 1.0]}},
+            "fidelity": rows, "num_wrong_way": 0, "num_unholdable": 5, "num_touching": 7,
+            "error_quantiles": {"50": 0.01, "95": 0.04 + 0.08 * share},
+            "error_quantiles_ci95": {"50": [0.0, 0.1], "95": [0.03, 0.05]},
+        }  # fmt: skip
+        return self.results[name]
+
+    monkeypatch.setattr(Book, "run", run)
+    fidelity.fidelity(book)
+    page = "\n".join(book.lines)
+    assert "| with | joint error | +1.0% [+0.0%,+2.0%] / " in page
+    assert "| 5%: **yes** | 1.0%, 12.0% [3.0%,5.0%] | 0 | 7 / 5 |" in page
+    assert "| 0 | 0.400 [0.000,1.000] | - |" in page
+    assert "| 0.5 | 0.320 [0.000,1.000] | -20.0% [-20.0%,-20.0%] |" in page
+    assert "at least 20% better than the raw reference: **holds**, -40.0% [-40.0%,-40.0%]." in page
+    assert (book.assets / "upper_agent.png").stat().st_size > 5000
+    assert len(asked) == 5 + 3 + 4  # tracking at five shares; fidelity at three more than in the table
+    assert set(asked.values()) == {("cotap", "velocity-tracking", 4), ("cotap", "fidelity", 4)}
 
 
 def test_a_walk_is_no_worse_within_a_tenth_or_the_interval():
@@ -189,12 +257,12 @@ def test_only_evaluations_of_the_same_policy_and_settings_are_kept(book, monkeyp
     path = book.evaluations / "row.json"
     book.run("row", "base", "impact", "--alpha", "0.5")
     written = json.loads(path.read_text())
-    assert "--per-env" in written["arguments"]
+    assert "--per-env" in written["about"]["arguments"]
     book.reuse = True
     for changed, kept in (
         ({}, True),
-        ({"settings": {"checkpoint_sha256": "other"}}, False),
-        ({"arguments": [*written["arguments"], "--seed", "1"]}, False),
+        ({"about": written["about"] | {"checkpoint_sha256": "other"}}, False),
+        ({"about": written["about"] | {"arguments": [*written["about"]["arguments"], "--seed", "1"]}}, False),
     ):
         asked.clear()
         book.results.clear()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,11 +12,11 @@ from reports.paper.tables import PAPER_ROBOT
 
 POLICIES = ("cotap", "base", "no-ratio", "torque-critic", "goals", "facet", "seed-0", "seed-1", "seed-2")
 """Names of all policies that a page may measure: two that ship, ablations, and CoTaP trained with three seeds."""
-PAIRED = ("impact", "constant-load", "periodic-load", "tour")
+PAIRED = ("impact", "constant-load", "periodic-load", "velocity-tracking", "tour")
 """Protocols that write every env's figures, so that two evaluations are compared env by env."""
 KEPT = (
     "protocol", "method", "num_envs", "num_falls", "window", "fidelity", "num_wrong_way", "num_unholdable",
-    "error_quantiles", "coverage", "impulse_50", "fall_curve", "falls",
+    "num_touching", "error_quantiles", "error_quantiles_ci95", "coverage", "impulse_50", "fall_curve", "falls",
 )  # fmt: skip
 """What results.json keeps of an evaluation, beside the measures that the page shows."""
 WITHOUT_FALLS = ("impact", "constant-load", "periodic-load")
@@ -131,11 +132,12 @@ class Book:
         """The content of results.json: no env's own figures, and no path of this machine."""
         rows = {}
         for name, result in self.results.items():
+            arguments = result["about"]["arguments"]
             measures = "metrics_without_falls" if result["protocol"] in WITHOUT_FALLS else "metrics"
             rows[name] = {
                 "policy": result["policy"],
                 "checkpoint_sha256": result["settings"]["checkpoint_sha256"],
-                "arguments": [result["arguments"][0], *result["arguments"][3:]],  # without the checkpoint's path
+                "arguments": [arguments[0], *arguments[3:]],  # without the checkpoint's path
                 **{key: result[key] for key in (*KEPT, measures) if key in result},
             }
         return {"robot": self.robot, "rows": rows, "differences": self.differences, "changes": self.changes}
@@ -156,18 +158,25 @@ def kept_or_run(path: Path, arguments: list[str], checkpoint: str, threads: int,
 
     With `reuse` what `path` has is taken if it is of the same checkpoint and arguments.
     """
-    from cotap.agents.checkpoint import sha256, write_json
+    from cotap.agents.checkpoint import sha256
     from cotap.evaluate import evaluate
     from cotap.evaluation.policy import find_checkpoint
 
     asked = [arguments[0], "--checkpoint", checkpoint, *arguments[1:]]
-    result = json.loads(path.read_text()) if reuse and path.is_file() else {}
-    if result.get("arguments") == asked and result["settings"]["checkpoint_sha256"] == sha256(
-        find_checkpoint(checkpoint)
-    ):
-        return result
+    about = {"arguments": asked, "checkpoint_sha256": sha256(find_checkpoint(checkpoint))}
+    return kept(path, reuse, about, lambda: evaluate([*asked, "--threads", str(threads)]))
+
+
+def kept(path: Path, reuse: bool, about: dict[str, Any], measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """What `measure` returns, written to `path`; with `reuse`, what `path` has, if it is `about` the same."""
+    from cotap.agents.checkpoint import write_json
+
+    about = json.loads(json.dumps(about))  # as it is read back
+    before = json.loads(path.read_text()) if reuse and path.is_file() else {}
+    if before.get("about") == about:
+        return before
     print(f"\n{path.stem}", flush=True)
-    result = evaluate([*asked, "--threads", str(threads)]) | {"arguments": asked}
+    result = measure() | {"about": about}
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, result)
     return result

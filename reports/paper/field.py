@@ -28,7 +28,7 @@ ROWS = (
     ),
     (
         "joints near their torque limit [%]", "0.93", "2.12", "2.74",
-        "no: here of the arms alone; the page does not say how near is near",
+        "in kind: here of arms, waist and legs; the page does not say how near is near",
     ),
     ("trials without a fall [%]", "98", "91", "59", "no: other forces, and trials whose length the page does not give"),
     ("share of the reaction that the legs take [%]", "31", "14", "16", "not measured here"),
@@ -48,7 +48,7 @@ def field(book: Book) -> None:
     book.add("", "## Measures of others")
     book.paragraph(WHAT, load=LOAD_N)
     book.table(
-        "arms", "e_ee, free [cm]", "impedance error, loaded [cm]", "arm joints near their torque limit [%]: free",
+        "arms", "e_ee, free [cm]", "impedance error, loaded [cm]", "joints near their torque limit [%]: free",
         "loaded", "trials without a fall [%]: free", "loaded",
     )  # fmt: skip
     for name, law in LAWS.items():

@@ -33,6 +33,16 @@ def plot_fall_curves(path: Path, results: dict[str, dict[str, Any]]) -> None:
     _finish(path, figure, axis[0], xlabel="impulse [N s]", ylabel="share of envs that fell", ylim=(-0.02, 1.02))
 
 
+def plot_trade_off(path: Path, points: list[tuple[str, float, float]]) -> None:
+    """Error of single hands' felt stiffness [%] against e_upper [rad], by the share of the policy's arm actions."""
+    figure, axis = _axes(1)
+    axis[0].plot([x for _, x, _ in points], [y for *_, y in points], "o-", color="#2171b5")
+    for share, x, y in points:
+        axis[0].annotate(share, (x, y), textcoords="offset points", xytext=(5, 5))
+    labels = {"xlabel": "e_upper [rad]", "ylabel": "error of the felt stiffness, 95 % of hands within [%]"}
+    _finish(path, figure, axis[0], **labels)
+
+
 def draw_pictures(book: Book, name: str, caption: str, shots: Iterable[Shot]) -> None:
     """A row of pictures of robots."""
     from cotap.evaluate import pictures
