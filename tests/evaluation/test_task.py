@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -11,23 +13,24 @@ import torch
 from cotap.compliance.laws import LawConfig
 from cotap.configs import BASE_RECIPES, DISTILL_RECIPES
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
-from cotap.envs.arm_task import TASK_WEIGHTS
+from cotap.envs.arm_task import TASK_WEIGHTS, task_forces
 from cotap.envs.modulation import ModulationConfig
 from cotap.envs.upper_body import UpperBodyConfig
 from cotap.evaluate import evaluate, main, parse, prepare
 from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.rollout import reference_actions
-from cotap.evaluation.task import step_figures, task_measures
-from reports.modulation_grid import Options
+from cotap.evaluation.task import Task, step_figures, task_measures
+from reports.modulation_grid import Options, Trial, asked, hand_states
 from reports.modulation_grid import main as grid
+
+MODULATED = UpperBodyConfig(*[LawConfig("cotap", alpha=0.5)] * 2, modulation=ModulationConfig("stiffness"))
 
 
 @pytest.fixture(scope="module")
 def modulated(tmp_path_factory):
     """A policy with random weights that sets alpha and stiffness."""
-    law = LawConfig("cotap", alpha=0.5)
-    laws = UpperBodyConfig(law, law, modulation=ModulationConfig("stiffness"))
-    return tmp_path_factory.mktemp("modulated") / "p.pt", HumanoidEnvConfig(num_envs=1, num_threads=1, upper_body=laws)
+    cfg = HumanoidEnvConfig(num_envs=1, num_threads=1, upper_body=MODULATED)
+    return tmp_path_factory.mktemp("modulated") / "p.pt", cfg
 
 
 @pytest.fixture
@@ -116,18 +119,105 @@ def test_its_alpha_is_what_was_asked_for(checkpoint_of, capsys):
     assert "episode_seconds" in capsys.readouterr().err
 
 
+def test_what_a_robot_that_falls_draws_is_nothing_to_the_others(make_env):
+    """Two rollouts of one seed; in one of them a robot begins again halfway."""
+    seen = []
+    for falls in (False, True):
+        task = Task(num_envs=6, seed=3)
+        env = make_env(6, forces=task_forces())
+        task.prepare(env)
+        env.reset()
+        for step in range(30):
+            task.before_step(env, step)
+            env.step(torch.zeros(6, env.num_actions))
+            if falls and step == 10:
+                env._restart(torch.tensor([True, *[False] * 5]))
+        seen.append(torch.cat((env.motions.current().position, env.commands.asked_velocity), 1))
+    assert torch.equal(seen[0][1:], seen[1][1:])
+    assert not torch.equal(seen[0][0], seen[1][0])
+
+
+BY_STATE = ((1.0, 900.0, 900.0, 900.0), (0.5, 600.0, 600.0, 1200.0), (0.9, 80.0, 80.0, 80.0))
+"""Alpha and stiffness of hands that are free, loaded and pushed."""
+
+
+def test_an_oracle_asks_for_the_setting_of_each_hands_state(make_env):
+    push, load, nothing = torch.tensor([10.0, 0.0, 0.0]), torch.tensor([0.0, 0.0, -20.0]), torch.zeros(3)
+    env = make_env(2)
+    env.step(torch.zeros(2, env.num_actions))
+    pushes = torch.stack((torch.stack((nothing, push)), torch.stack((push, nothing))))
+    loads = torch.stack((torch.stack((nothing, nothing)), torch.stack((load, load))))
+    env.record = replace(env.record, hand_force_w=pushes + loads, hand_push_w=pushes)
+    state = hand_states(env)
+    assert state.tolist() == [[0, 2], [1, 1]]  # a push on a loaded hand is no reason to drop the load
+    wanted = asked(BY_STATE, state).unflatten(1, (2, 4))
+    torch.testing.assert_close(wanted[..., 0], torch.tensor([[1.0, 0.9], [0.5, 0.5]]))
+    torch.testing.assert_close(wanted[0, 1, 1:].exp(), torch.full((3,), 80.0))
+    torch.testing.assert_close(wanted[1, 0, 1:].exp(), torch.tensor([600.0, 600.0, 1200.0]))
+
+
+def test_an_oracle_is_as_slow_as_a_policy():
+    """By hand: from alpha 0.5 and 300 N/m, 0.08 and a factor of e^0.2 a step, up to what is asked for."""
+    trial = Trial(num_envs=2, by_state=BY_STATE, passive=True)
+    cfg = trial.configure(HumanoidEnvConfig(num_threads=1, upper_body=copy.deepcopy(MODULATED)))
+    cfg.forces.hand_loads.enabled = cfg.forces.pushes.enabled = False
+    assert cfg.upper_body.left.passive
+    assert cfg.upper_body.modulation.held
+    env = HumanoidEnv(cfg)
+    trial.prepare(env)
+    alpha, stiffness = [], []
+    for step in range(8):
+        trial.before_step(env, step)
+        env.step(torch.zeros(2, env.num_actions))
+        alpha.append(float(env.upper_body.parameters.alpha[1, 0]))
+        stiffness.append(float(env.upper_body.parameters.stiffness[1, 1, 2]))
+    assert alpha == pytest.approx([min(0.5 + 0.08 * (k + 1), 1.0) for k in range(8)], abs=1e-6)
+    assert stiffness == pytest.approx([min(300.0 * math.exp(0.2 * (k + 1)), 900.0) for k in range(8)], rel=1e-5)
+
+
+def test_refined_settings_lie_around_the_best_and_within_the_grid():
+    options = Options(stiffnesses=(80.0, 1200.0))
+    found = options.refined((0.5, 300.0, 300.0, 600.0), 2.0)
+    assert set(found) == {
+        (0.5, 600.0, 300.0, 600.0), (0.5, 300.0, 600.0, 600.0), (0.5, 300.0, 300.0, 1200.0),
+        (0.5, 600.0, 600.0, 600.0), (0.5, 150.0, 300.0, 600.0), (0.5, 300.0, 150.0, 600.0),
+        (0.5, 300.0, 300.0, 300.0), (0.5, 150.0, 150.0, 600.0),
+    }  # fmt: skip
+    assert set(options.refined((1.0, 1200.0, 1200.0, 80.0), 100.0)) == {
+        (1.0, 1200.0, 1200.0, 1200.0), (1.0, 80.0, 1200.0, 80.0), (1.0, 1200.0, 80.0, 80.0), (1.0, 80.0, 80.0, 80.0)
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [({"alphas": (2.0,)}, r"alphas\[0\]"), ({"stiffnesses": ()}, "number of stiffnesses"),
+     ({"grid_envs": 0}, "grid_envs"), ({"episode_seconds": 0.0}, "episode_seconds")],
+)  # fmt: skip
+def test_bad_options_of_the_grid_are_named(fields, message):
+    with pytest.raises(ValueError, match=message):
+        Options(**fields).check()
+
+
 @pytest.mark.slow
 def test_the_grid_compares_with_its_best(checkpoint_of, tmp_path, capsys):
     args = ["--checkpoint", str(checkpoint_of), "--alphas", "0", "1", "--stiffnesses", "100", "900", "--num-envs", "4"]
+    args += ["--grid-envs", "2", "--threads", "1"]
     assert grid([*args, "--episode-seconds", "0.4", "--output", str(tmp_path)]) == 0
     result = json.loads((tmp_path / "modulation_grid.json").read_text())
-    assert [(r["alpha"], r["stiffness"]) for r in result["grid"]] == [(0.0, 100.0), (1.0, 100.0), (1.0, 900.0)]
-    best = max(result["grid"], key=lambda r: r["metrics"]["return"]["mean"])
-    assert (result["best"]["alpha"], result["best"]["stiffness"]) == (best["alpha"], best["stiffness"])
-    gained = result["learned_less_best"]["return"]["difference"]
-    means = (result[name]["metrics"]["return"]["mean"] for name in ("learned", "best"))
-    learned, constant = means
-    assert gained == pytest.approx(learned - constant)
-    assert "set by the policy" in capsys.readouterr().out
-    with pytest.raises(ValueError, match=r"alphas\[0\]"):
-        Options("p.pt", alphas=(2.0,)).check()
+    settings = [tuple(row["setting"]) for row in result["grid"]]
+    assert settings[:3] == [(0.0, 100.0, 100.0, 100.0), (1.0, 100.0, 100.0, 100.0), (1.0, 900.0, 900.0, 900.0)]
+    assert len(set(settings)) == len(settings) > 6
+    for measure, found in (("return", result["best"]), *((f"return_{k}", v) for k, v in result["by_state"].items())):
+        assert found == max(result["grid"], key=lambda row: row["metrics"][measure]["mean"])["setting"], measure
+    rows = result["compared"]
+    assert [row["passive"] for row in rows] == [False] * 3 + [True] * 3
+    constant, _, learned = rows[:3]
+    assert not any(row["difference"] for row in constant["less_constant"].values())
+    gained = learned["less_constant"]["return"]
+    assert gained["pairs"] == 4
+    assert gained["difference"] == pytest.approx(
+        learned["metrics"]["return"]["mean"] - constant["metrics"]["return"]["mean"], abs=1e-5
+    )
+    shown = capsys.readouterr().out
+    assert "set by the policy; no store" in shown
+    assert "oracle: set by the hand's true state; store" in shown

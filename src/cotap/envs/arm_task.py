@@ -14,10 +14,10 @@ TASK_WEIGHTS = {"free_hand_error": -20.0, "loaded_hand_error": -20.0, "push_resi
 
 
 def task_forces() -> ExternalForceConfig:
-    """Loads on hands, and pushes on hands that an arm can give way to."""
+    """Loads on hands, and pushes on hands, long enough that a hand has gone out of the way before they end."""
     loads = HandLoadConfig(enabled=True, force_x=(-25.0, 25.0), force_y=(-25.0, 25.0), force_z=(-40.0, 0.0))
     pushes = PushConfig(
-        enabled=True, episode_share=1.0, velocity=(0.15, 0.35), hand_share=1.0, link_share=0.0,
-        duration_s=(0.5, 1.0), interval_s=(1.5, 3.5),
+        enabled=True, episode_share=1.0, velocity=(0.3, 0.7), hand_share=1.0, link_share=0.0,
+        duration_s=(1.0, 2.0), interval_s=(2.5, 4.5),
     )  # fmt: skip
     return ExternalForceConfig(loads, pushes)
