@@ -174,6 +174,27 @@ def test_the_command_runs_it_in_pybullet(robot, random_checkpoint, tmp_path, cap
     assert "tour, pd, arms moving: 0 of 2 envs fell" in capsys.readouterr().out
 
 
+@pytest.mark.slow
+def test_arms_under_cotap_go_the_tour_in_pybullet(checkpoint_of, steps):
+    pytest.importorskip("pybullet")
+    checkpoint = checkpoint_of(robot="g1")
+    tour, env = prepared(checkpoint, "cotap", num_envs=1)
+    tour.engine = "pybullet"
+    result = evaluate_in_engine(tour, checkpoint, env.cfg)
+    assert len(steps) == 40
+    assert result["num_falls"] == 0
+    assert result["metrics"]["survival_s"]["mean"] == pytest.approx(0.8)
+    upper = env.action_slices["upper"]
+    lower = np.array([joint.kp for joint in env.spec.joints[: upper.start]])
+    for _, targets, law, *_ in steps:
+        arms = np.asarray(law.stiffness)[upper, upper]
+        np.testing.assert_allclose(arms, arms.T, atol=1e-3)
+        assert np.abs(arms - np.diag(np.diag(arms))).max() > 1.0  # where PD's stiffness has zeros
+        assert (np.linalg.eigvalsh(arms) > 0.0).all()
+        np.testing.assert_allclose(np.diag(law.stiffness)[: upper.start], lower)
+        assert np.isfinite(targets).all()
+
+
 def test_that_pybullet_is_not_installed_is_said(checkpoint_of, monkeypatch, capsys):
     original = builtins.__import__
 

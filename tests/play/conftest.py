@@ -53,7 +53,7 @@ def server(free_port: int) -> Iterator[ViserServer]:
 @pytest.fixture
 def two_shipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Policies of two robots, as if they were shipped; those that are shipped are not there."""
-    names = {f"{robot}-base": save_random_policy(tmp_path / f"{robot}.pt", robot=robot) for robot in ("h1", "made-up")}
+    names = {f"{robot}-base": save_random_policy(tmp_path / f"{robot}.pt", robot=robot) for robot in ("h1", "g1")}
     monkeypatch.setattr("cotap.evaluation.policy.shipped_names", lambda: list(names))
     monkeypatch.setattr("cotap.evaluation.policy.shipped_checkpoint", names.get)
 

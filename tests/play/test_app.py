@@ -117,20 +117,20 @@ def choose(app, robot):
 def test_another_robot_is_chosen_and_the_first_one_again(server, checkpoint, tmp_path):
     options = PlayOptions(checkpoint=(str(checkpoint),), output=str(tmp_path / "out"))
     app = _live(options)(server)
-    assert choose(app, "h1").options == ("h1", "made-up")
+    assert choose(app, "h1").options == ("h1", "g1")
     app.mailbox.ask(Record(True))
     app.mailbox.set("a.left.stiffness_x", 700.0)
     app.advance()
-    choose(app, "made-up")
-    assert app.run() == "made-up"
+    choose(app, "g1")
+    assert app.run() == "g1"
     assert len(load_recording(app.archive.path).trajectory.fell) >= 1  # what was recorded is kept
-    other = restart(server, options, "made-up")
-    assert other.session.env.spec.name == "made-up"
-    assert other.session.controls["a.checkpoint"].options == ("shipped made-up-base",)
+    other = restart(server, options, "g1")
+    assert other.session.env.spec.name == "g1"
+    assert other.session.controls["a.checkpoint"].options == ("shipped g1-base",)
     assert other.session.values["a.left.stiffness_x"] == 300.0
     other.advance()
     other.scene.show(other._latest[1])
-    assert choose(other, "h1").options == ("h1", "made-up")
+    assert choose(other, "h1").options == ("h1", "g1")
     first = restart(server, options, other.run())
     assert first.session.controls["a.checkpoint"].options == (str(checkpoint), "shipped h1-base")
     first.advance()
@@ -144,10 +144,10 @@ def test_a_robot_that_is_not_offered_or_comes_while_a_film_is_made_is_refused(se
     app.notices.tell = lambda text, *_: told.append(text)
     assert choose(app, "atlas").value == "h1"
     app.archive.filming.set()
-    assert choose(app, "made-up").value == "h1"
+    assert choose(app, "g1").value == "h1"
     app.archive.filming.clear()
     assert told == [
-        "robot 'atlas' is unknown; known: h1, made-up",
+        "robot 'atlas' is unknown; known: h1, g1",
         "a film is being made; choose a robot when it is done",
     ]
     assert not app._stop.is_set()

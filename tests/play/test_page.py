@@ -357,7 +357,7 @@ def test_another_robot_comes_onto_the_same_page(free_port: int, tmp_path: Path):
     thread.start()
     viewers = server.get_clients
     with opened(apps[0]) as page:
-        for number, robot in ((1, "made-up"), (2, "h1")):
+        for number, robot in ((1, "g1"), (2, "h1")):
             before = max(viewers())
             page.tab("Robot")
             page.page.get_by_role("combobox", name="robot").click()

@@ -149,13 +149,19 @@ def test_stiffness_stays_what_was_set_under_a_policy_that_was_trained_with_all(t
     assert parameters.alpha.tolist() == [[1.0, 1.0], [1.0, 0.25]]
 
 
-def test_a_robot_with_other_arms_has_all_laws(tmp_path):
-    session = Session({"base": save_random_policy(tmp_path / "base.pt", robot="made-up")})
+@pytest.mark.parametrize("robot", ["g1", "made-up"])
+def test_a_robot_with_other_arms_has_all_laws(robot, tmp_path):
+    session = Session({"base": save_random_policy(tmp_path / "base.pt", robot=robot)})
     law = session.controls["a.left.law"]
     assert law.options == tuple(LAWS)
-    assert session.set({"a.left.law": "cotap", "motion": "rest"}) == []
+    assert session.set({"a.left.law": "pd", "motion": "rest"}) == []
+    assert session.set({"a.left.law": "cotap", "b.left.law": "pd", "arm_actions": False}) == []
+    session.push(Push("left", (20.0, 0.0, 0.0), 0.2))
     sample = run(session, 3)[-1]
     assert sample["arm_torque"].shape == (2, 14)
+    np.testing.assert_allclose(np.linalg.norm(sample["hand_force_w"][:, LEFT], axis=-1), 20.0, rtol=1e-4)
+    assert np.isnan(sample["commanded_stiffness"][1, LEFT]).all()
+    np.testing.assert_allclose(np.diag(sample["effective_stiffness"][0, LEFT]), 300.0, rtol=0.05)
     assert sample["qpos"].shape == (2, 7 + len(session.env.spec.joints))
 
 

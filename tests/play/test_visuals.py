@@ -11,13 +11,14 @@ from cotap.play.visuals import RobotPose, menagerie_file, visual_model
 TETRAHEDRON = "v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 
 
-def test_bodies_are_where_mujoco_has_them_and_standing_feet_touch_the_floor(spec, model, monkeypatch):
+def test_bodies_are_where_mujoco_has_them_and_standing_feet_touch_the_floor(any_spec, any_model, monkeypatch):
+    spec, model = any_spec, any_model
     monkeypatch.setattr("cotap.play.visuals.menagerie_file", lambda _: None)
     visual, origin = visual_model(spec)
     assert origin == "cotap"
     assert mujoco.mj_name2id(visual, mujoco.mjtObj.mjOBJ_GEOM, "floor") == -1
     data = mujoco.MjData(model)
-    data.qpos[2] = spec.nominal_height_m - 0.002
+    data.qpos[2] = spec.base_height_m - 0.002
     data.qpos[3:7] = 0.6, 0.0, 0.0, 0.8
     data.qpos[7:] = [j.default_rad for j in spec.joints]
     mujoco.mj_forward(model, data)
