@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import mujoco
 import numpy as np
 import pytest
@@ -37,6 +39,16 @@ def standing(spec, model, lift=0.0) -> mujoco.MjData:
 
 def test_is_registered(spec):
     assert ROBOTS["g1"]() is spec
+
+
+def test_the_page_says_how_many_lines_it_takes():
+    root = Path(__file__).parents[2]
+    lines = [
+        (root / "src/cotap/robots" / name).read_text(encoding="utf-8").count("\n")
+        for name in ("facts/g1.json", "g1.py")
+    ]
+    page = (root / "docs/robots.md").read_text(encoding="utf-8")
+    assert "`robots/facts/` (G1: {} lines), a file like `robots/g1.py` ({})".format(*lines) in page
 
 
 def test_joints_and_whose_they_are(spec, model):
