@@ -1,6 +1,6 @@
 """Every law of the arms side by side: the paper's Table VI and Fig. 9, and what backs its Table I.
 
-python -m reports.compare_laws static --pelvis free --num-envs 384
+python -m reports.compare_laws static --num-envs 384
 python -m reports.compare_laws transient --num-envs 256
 python -m reports.compare_laws properties
 

@@ -6,6 +6,7 @@ import json
 import math
 import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,8 @@ from random_policy import save_random_policy
 from cotap.agents.checkpoint import sha256
 from cotap.evaluate import pictures
 from reports import reproduce_paper as rp
-from reports.paper import ablation, fidelity, observation, relative, tour, walking, words
+from reports.compare_laws import Static, Transient
+from reports.paper import ablation, facet, fidelity, observation, relative, sim_to_sim, tour, walking, words
 from reports.paper.arms import COMPLIANT, PD, SOFT, arms, label, mass
 from reports.paper.book import Book
 from reports.paper.tables import IMPACT, ORDERINGS
@@ -316,6 +318,100 @@ def test_that_pybullet_is_not_there_is_said(tmp_path, monkeypatch):
     tour.tour(book)
     assert any("PyBullet is not installed" in line for line in book.lines)
     assert not any("| PyBullet |" in line for line in book.lines)
+
+
+@pytest.fixture
+def trained(book) -> Book:
+    """With policies that have learned nothing."""
+    for seed, name in enumerate(("cotap", "facet")):
+        (book.folder / name).mkdir()
+        book.policies[name] = str(save_random_policy(book.folder / name / "policy.pt", "distill", seed=seed))
+    return book
+
+
+def test_the_laws_beside_cotap_are_a_part_with_facets_own_policy(trained, monkeypatch):
+    """Asked of `compare_laws`, kept, and measured again for another policy."""
+    at_rest = {"displacement": [0.021, None, 0.09], "half_interval": [0.001, None, 0.002], "torque_saturated": False,
+               "num_falls": 0, "num_envs": 6}  # fmt: skip
+    names = ("cotap, joint error", "facet", "cotap+facet, joint error")
+    static = {"loads_n": (10.0, 30.0, 50.0), "ideal": [0.02, 0.06, 0.1], "rows": dict.fromkeys(names, at_rest)}
+    nothing = {"mean": None, "ci95": None}
+    keys = (
+        "e_ee_hit",
+        "share_at_limit",
+        "transient_energy",
+        "oscillation_energy",
+        "overshoot",
+        "overshoots",
+        "settle_s",
+    )
+    struck = {"metrics": dict.fromkeys(keys, nothing), "num_falls": 1, "num_envs": 4, "curve": {"time": []}}
+    asked = []
+    for table, result in ((Static, static), (Transient, {"forces": {"500": {"pd": struck}}})):
+        monkeypatch.setattr(table, "measure", lambda self, result=result: asked.append(self) or result)
+    facet.facet(trained)
+    page = "\n".join(trained.lines)
+    assert (
+        "| facet | 0.0210 +- 0.0010 (+5%) | - | 0.0900 +- 0.0020 (-10%) |  | 0 of 6 | 0.043 / 0.068 / 0.106 |" in page
+    )
+    assert "ours goes down by 0.021 / - / 0.090 m." in page
+    assert "The row *facet* has the policy `facet`" in page
+    assert "**500 N for 50 ms, stance, pelvis free, arms held, 500 N/m**" in page
+    for name in ("laws_static", "laws_transient"):
+        assert (trained.assets / f"{name}.png").stat().st_size > 5000
+    for table in asked:
+        assert (table.checkpoint, table.facet_checkpoint) == (trained.policies["cotap"], trained.policies["facet"])
+        assert (table.null_stiffness, table.upper_actions, table.threads) == (25.0, "policy", 1)
+    assert [table.num_envs for table in asked] == [6, 4]  # of a load no fewer than one
+    for table in (Static, Transient):  # no more pictures
+        monkeypatch.setattr(table, "draw", lambda *_: None)
+    monkeypatch.setattr("cotap.evaluation.report.save_figure", lambda *_: None)
+    trained.reuse = True
+    facet.facet(trained)
+    assert len(asked) == 2
+    trained.policies["facet"] = trained.policies["cotap"]
+    facet.facet(trained)
+    assert len(asked) == 4
+    del trained.policies["facet"]
+    facet.facet(trained)
+    assert [table.facet_checkpoint for table in asked[4:]] == ["", ""]
+    assert any("all rows have `cotap`" in line for line in trained.lines)
+
+
+@pytest.mark.parametrize("reuse", [True, False])
+def test_sim_to_sim_is_a_part_that_goes_on_where_it_stopped(trained, monkeypatch, reuse):
+    trained.reuse, asked = reuse, []
+    parts = trained.evaluations / "sim-to-sim"
+    parts.mkdir(parents=True)
+    (parts / "mujoco-impact.json").touch()
+
+    def compare(path, cfg, jobs, kept):
+        asked.append((path.name, cfg.engines, cfg.trials, cfg.perturbed_trials, cfg.load_trials, cfg.motion, jobs))
+        assert (kept / "mujoco-impact.json").exists() == reuse
+        return {}
+
+    module = "cotap.deployment.sim_to_sim"
+    monkeypatch.setattr(f"{module}.compare", compare)
+    monkeypatch.setattr(f"{module}.markdown", lambda _: "## Impact, arms moving\n\n| a |\n|---|\n")
+    monkeypatch.setattr(f"{module}.figure", lambda _, path: path.write_bytes(b"picture"))
+    monkeypatch.setattr("cotap.deployment.graph.export_policy", lambda _source, path, checks: path.touch() or checks)
+    monkeypatch.setattr(sim_to_sim, "installed", lambda _: (("mujoco",), "pybullet is not installed: not measured."))
+    sim_to_sim.sim_to_sim(trained)
+    assert asked == [("policy.onnx", ("mujoco",), 4, 4, 4, "mixture", 1)]
+    page = "\n".join(trained.lines)
+    assert "\n### Impact, arms moving\n\n| a |\n" in page
+    assert "pybullet is not installed: not measured." in page
+    assert (trained.assets / "sim_to_sim.png").read_bytes() == b"picture"
+
+
+def test_an_engine_that_is_not_installed_is_named(monkeypatch):
+    def make(cfg, spec):
+        if cfg.engine == "pybullet":
+            raise ModuleNotFoundError(spec.name)
+        return SimpleNamespace(close=lambda: None)
+
+    monkeypatch.setattr("cotap.deployment.engines.make_engine", make)
+    assert sim_to_sim.installed("h1") == (("mujoco",), "pybullet is not installed: not measured.")
 
 
 def test_only_the_parts_that_are_asked_for_are_measured(tmp_path, monkeypatch):
