@@ -70,7 +70,7 @@ class Options(Generic[P]):
     checkpoint: str = ""
     """Policy to evaluate: a file, or a shipped policy's name. By default what ships of --robot."""
     robot: str = ""
-    """Name of the robot whose shipped policy is evaluated, the one under compliance if there is one; by default h1."""
+    """Robot whose shipped policy to take. Under compliance, if there is one; by default h1."""
     backend: str = "auto"
     """What simulates: mujoco, mjbatch (both on the CPU), warp (a GPU) or auto. auto takes warp if there is a GPU and
     the extra `warp` is installed, else mjbatch if that is installed, else mujoco. Results are reproducible on one

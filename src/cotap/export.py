@@ -22,7 +22,7 @@ class ExportOptions:
     checkpoint: str = ""
     """Policy to export: a file, or a shipped policy's name. By default what ships of --robot."""
     robot: str = ""
-    """Name of the robot whose shipped policy is exported, the one under compliance if there is one; by default h1."""
+    """Robot whose shipped policy to take. Under compliance, if there is one; by default h1."""
     checks: int = 1000
     """Observations on which to compare file and torch. The file is kept only if they agree."""
     seed: int = 0
