@@ -333,6 +333,7 @@ def test_bad_comparisons_are_named(policy_file, capsys, tmp_path):
         (["--trials", "0"], "trials must be a positive integer"),
         (["--episode-seconds", "1"], "episode_seconds must lie in"),
         (["--jobs", "-1"], "jobs must lie in"),
+        (["--motion", "moonwalk", "--jobs", "1"], "no clip is called 'moonwalk'"),
     ):
         assert script.main(["--policy", str(policy_file), "--output", str(tmp_path), *arguments]) == 2
         assert message in capsys.readouterr().err

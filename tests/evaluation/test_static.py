@@ -165,7 +165,10 @@ def test_arms_are_as_trained_unless_options_say_otherwise():
     assert (changed.left.stiffness, changed.left.null_stiffness) == ((500.0,) * 3, 33.0)
     assert (changed.torso.model, changed.singularity_ratio) == ("none", True)
     assert LawOptions("cotap").configure(UpperBodyConfig()).left == LawConfig("cotap")  # trained under PD
-    assert LawOptions("facet").configure(trained).right == LawConfig("facet")
+    assert LawOptions("cotap+facet").configure(trained).left == LawConfig(
+        "cotap+facet", null_stiffness=33.0, damping="pd"
+    )
+    assert LawOptions("hmc").configure(trained).right == LawConfig("hmc", alpha=0.3)
     assert LawOptions(left="cotap:alpha=0.5").configure(trained).left.damping == "pd"
 
 
