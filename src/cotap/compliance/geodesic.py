@@ -17,8 +17,8 @@ import torch
 from cotap.compliance.arguments import symmetric_part
 from cotap.compliance.spd import log_from_eigenvectors
 
-_ITERATIONS = 8
-"""Of the search for a share. Its bracket at least halves each time, and shrinks quadratically once it is small."""
+_ITERATIONS = 12
+"""Of the search for a share. Each at least halves what is left, and squares it once it is small."""
 
 
 class HeldStiffness(NamedTuple):
@@ -55,23 +55,26 @@ def held_stiffness(
     half = torch.linalg.solve_triangular(factor, new, upper=False)
     ratio = symmetric_part(torch.linalg.solve_triangular(factor, half.transpose(-1, -2), upper=False))
     values, vectors = torch.linalg.eigh(ratio.detach())
-    tall = (factor.transpose(-1, -2) @ e.unsqueeze(-1)).squeeze(-1)
-    weights = (vectors.transpose(-1, -2) @ tall.detach().unsqueeze(-1)).squeeze(-1).square()
+    axes = factor.detach() @ vectors
+    weights = (axes.transpose(-1, -2) @ e.detach().unsqueeze(-1)).squeeze(-1).square()
     rates = values.clamp_min(torch.finfo(torch.float64).tiny).log()
     left = 2.0 * room.detach() - _rounding(old, new, e, k_old.dtype).detach()
     share = _largest_share(weights, rates, weights.sum(-1) + left)
 
-    whole = (vectors * (share.unsqueeze(-1) * rates).exp().unsqueeze(-2)) @ vectors.transpose(-1, -2)
-    if torch.is_grad_enabled():  # the same, differentiable at equal eigenvalues, too
+    if torch.is_grad_enabled():  # differentiable at equal eigenvalues, too
         log = log_from_eigenvectors(ratio, values, vectors)
         whole = torch.linalg.matrix_exp(share[..., None, None] * log)
         # Value zero; derivatives those of the equation that the share solves (implicit function theorem).
+        tall = (factor.transpose(-1, -2) @ e.unsqueeze(-1)).squeeze(-1)
         excess = (tall * (whole @ tall.unsqueeze(-1)).squeeze(-1)).sum(-1) - tall.square().sum(-1) - 2.0 * room
         slope = (weights * rates * (share.unsqueeze(-1) * rates).exp()).sum(-1)
         moved = -(excess - excess.detach()) / torch.where(slope > 0.0, slope, torch.inf)
         whole = whole + moved[..., None, None] * (log @ whole)
         share = share + moved
-    between = symmetric_part(factor @ whole @ factor.transpose(-1, -2)).to(k_old.dtype)
+        between = factor @ whole @ factor.transpose(-1, -2)
+    else:
+        between = (axes * (share.unsqueeze(-1) * rates).exp().unsqueeze(-2)) @ axes.transpose(-1, -2)
+    between = symmetric_part(between).to(k_old.dtype)
 
     free = change_energy(old, new, e) <= room
     stiffness = torch.where(free[..., None, None], k_new, between)
@@ -95,8 +98,8 @@ def _largest_share(weights: torch.Tensor, rates: torch.Tensor, bound: torch.Tens
     """Largest s (...) with `sum_i w_i exp(r_i s) <= bound`, for weights and rates (..., n).
 
     At 0 the sum must be within the bound, but for rounding, and at 1 above it; otherwise the result means nothing. Its
-    logarithm is convex as well and nearly straight: a tangent cuts where the sum is above the bound, a chord where it
-    is within.
+    logarithm is convex and nearly straight: Newton's steps from 1 come down to where it meets the bound. It bends by at
+    most a quarter of the squared spread of the rates, which tells how much further down it is surely within.
     """
     tiny = torch.finfo(weights.dtype).tiny
     aim = bound.clamp_min(tiny).log()
@@ -107,13 +110,13 @@ def _largest_share(weights: torch.Tensor, rates: torch.Tensor, bound: torch.Tens
         total = terms.sum(-1).clamp_min(tiny)
         return total.log() - aim, (terms * rates).sum(-1) / total
 
-    low, high = torch.zeros_like(bound), torch.ones_like(bound)
+    share = torch.ones_like(bound)
     for _ in range(_ITERATIONS):
-        middle = 0.5 * (low + high)
-        inside = excess(middle)[0] <= 0.0
-        low, high = torch.where(inside, middle, low), torch.where(inside, high, middle)
-        (under, _), (over, slope) = excess(low), excess(high)
-        tangent = high - over / torch.where(slope > 0.0, slope, torch.inf)
-        chord = low - under * (high - low) / torch.where(over > under, over - under, torch.inf)
-        low, high = torch.minimum(torch.maximum(chord, low), high), torch.minimum(torch.maximum(tangent, low), high)
-    return low
+        over, slope = excess(share)
+        share = (share - over / torch.where(slope > 0.0, slope, torch.inf)).clamp(0.0, 1.0)
+    over, slope = excess(share)
+    over = over.clamp_min(0.0)
+    bend = 0.25 * (rates.amax(-1) - rates.amin(-1)).square()
+    square = slope.square() - 2.0 * bend * over
+    within = share - 2.0 * over / (slope + square.clamp_min(0.0).sqrt())
+    return torch.where((slope > 0.0) & (square > 0.0), within, 0.0).clamp_min(0.0)
