@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -25,6 +26,7 @@ def arms(spec):
 def a_state(arms, n=3, **fields) -> ArmState:
     q = torch.tensor([[0.1, 0.3, 0.2, 0.3], [0.1, -0.3, -0.2, 0.3]]).repeat(n, 1, 1)
     pitch = torch.tensor([[0.995, 0.0, 0.0998], [0.0, 1.0, 0.0], [-0.0998, 0.0, 0.995]])
+    fields = {"fresh": torch.ones(n, 2, dtype=torch.bool)} | fields
     return ArmState(q, torch.zeros_like(q), q + 0.05, arms.chains.pose(q), pitch.expand(n, 3, 3), dt=DT, **fields)
 
 
@@ -197,3 +199,13 @@ def test_references_go_on_from_where_they_were_moved_to(arms, name):
     ways = torch.stack(offsets).diff(dim=0).abs()
     assert (ways <= DT * arms.speed + 1e-5).all()
     assert float((offsets[-1].abs() / (DT * arms.speed)).max()) > 1.3
+
+
+@pytest.mark.parametrize("fresh", [None, torch.zeros(3, dtype=torch.bool), torch.zeros(3, 1, dtype=torch.bool)])
+def test_a_law_that_remembers_must_be_told_which_arms_are_fresh(arms, fresh):
+    got = None if fresh is None else tuple(fresh.shape)
+    with pytest.raises(
+        ValueError, match=re.escape(f"fresh must have shape (3, 2) for a law that remembers, got {got}")
+    ):
+        LAWS["facet"](arms, LawConfig("facet"))(a_state(arms, fresh=fresh), parameters())
+    LAWS["cotap"](arms, LawConfig("cotap"))(a_state(arms, fresh=fresh), parameters())  # remembers nothing

@@ -45,7 +45,8 @@ def test_autocast_does_not_change_a_law(spec, rng, name):
     q = 0.5 * torch.randn(5, 2, 4, generator=rng)
     turn, _ = torch.linalg.qr(torch.randn(5, 3, 3, generator=rng))
     base = 1e-4 * torch.eye(3).expand(5, 2, 3, 3)
-    state = ArmState(q, 0.1 * q, q + 0.1, arms.chains.pose(q), turn, base, torch.ones(5, 2, 3), 0.1 * q)
+    fresh = torch.ones(5, 2, dtype=torch.bool)
+    state = ArmState(q, 0.1 * q, q + 0.1, arms.chains.pose(q), turn, base, torch.ones(5, 2, 3), 0.1 * q, fresh)
     parameters = LawParameters(torch.full((5, 2, 3), 300.0), torch.full((5, 2), 25.0), torch.full((5, 2), 0.7))
 
     def torque(position: torch.Tensor) -> torch.Tensor:

@@ -190,3 +190,82 @@ def test_arms_that_begin_anew_have_a_full_store_and_what_they_ask_for(arms, rng)
     assert report.values["held_back"][[0, 2]].tolist() == [[0.0, 0.0]] * 2
     assert float(report.values["held_back"][1].min()) > 0.0
     torch.testing.assert_close(torque.stiffness[[0, 2]], plain.stiffness[[0, 2]])
+
+
+def at_rest(arms, n, fresh=False, away=0.3) -> ArmState:
+    q = HOME.double().expand(n, 2, 4)
+    upright = torch.eye(3, dtype=q.dtype).expand(n, 3, 3)
+    begun = torch.full((n, 2), fresh)
+    return ArmState(q, 0.0 * q, q + away, arms.chains.pose(q), upright, fresh=begun, dt=DT)
+
+
+@pytest.mark.parametrize("error", ["joint", "task"])
+def test_a_change_that_is_not_a_number_is_not_made_and_empties_the_store(arms, error):
+    law = PassiveCoTaPLaw(arms, LawConfig("cotap", error=error, passive=True))
+    before, _ = law(at_rest(arms, 3, fresh=True), parameters(3))
+    broken = parameters(3)
+    broken.stiffness[1, 0] = torch.nan
+    for _ in range(2):
+        torque, report = law(at_rest(arms, 3), broken)
+        assert torch.equal(torque.stiffness, before.stiffness)
+        torch.testing.assert_close(torque.elastic, before.elastic, rtol=1e-14, atol=1e-14)
+        assert report.values["store_energy"].tolist() == [[2.0, 2.0], [0.0, 2.0], [2.0, 2.0]]
+        assert report.values["held_back"].tolist() == [[0.0, 0.0], [1.0, 0.0], [0.0, 0.0]]
+    softer, _ = CoTaPLaw(arms, LawConfig("cotap", error=error))(at_rest(arms, 3), parameters(3, 250.0))
+    torque, report = law(at_rest(arms, 3), parameters(3, 250.0))
+    torch.testing.assert_close(torque.stiffness, softer.stiffness)  # which fills the store
+    assert 0.0 < float(report.values["store_energy"][1, 0]) <= 2.0
+
+
+def test_an_arm_that_begins_with_what_is_not_a_number_takes_the_next_command_with_an_empty_store(arms):
+    law, broken = PassiveCoTaPLaw(arms, LawConfig("cotap", passive=True)), parameters(2)
+    broken.stiffness[0, 1] = torch.nan
+    law(at_rest(arms, 2, fresh=True), broken)
+    torque, report = law(at_rest(arms, 2), parameters(2))
+    plain, _ = CoTaPLaw(arms, LawConfig("cotap"))(at_rest(arms, 2), parameters(2))
+    assert torch.equal(torque.stiffness, plain.stiffness)
+    assert report.values["store_energy"].tolist() == [[2.0, 0.0], [2.0, 2.0]]
+    _, report = law(at_rest(arms, 2, away=0.05), parameters(2, 1200.0))
+    assert float(report.values["held_back"][0, 1]) > 0.9
+    assert float(report.values["held_back"][1, 1]) < 0.8
+
+
+class Switching:
+    """Laws of the joint and of the task error in turns, each for seven steps."""
+
+    def __init__(self, arms, carried, **fields) -> None:
+        configs = [LawConfig("cotap", error=error, passive=True, **fields) for error in ("joint", "task")]
+        self.laws, self.carried, self.step = [PassiveCoTaPLaw(arms, cfg) for cfg in configs], carried, 0
+
+    def __call__(self, state, p):
+        before, now = (self.laws[step // 7 % 2] for step in (self.step - 1, self.step))
+        if now is not before and self.step:
+            for env, arm in torch.cartesian_prod(torch.arange(len(state.position)), torch.arange(2)).tolist():
+                assert now.take_over(env, arm, before.memory, state.position)
+            if not self.carried:
+                state = replace(state, fresh=torch.ones_like(state.fresh))
+        self.step += 1
+        return now(state, p)
+
+
+def test_switching_between_passive_laws_draws_no_more_than_one_of_them(arms, rng):
+    """And much more where every one of them begins with a full store."""
+    arms = replace(arms, kd=0.02 * arms.kd)
+    fields = {"damping": "pd", "store_energy": 0.3, "store_power": 1e3}
+    drawn, level, _ = pulled(arms, Switching(arms, carried=True, **fields), 4, 90, knowing, rng)
+    assert float(drawn.max()) <= 0.3 + 1e-9
+    assert float(level.min()) >= 0.0
+    refilled, _, _ = pulled(arms, Switching(arms, carried=False, **fields), 4, 90, knowing, rng)
+    assert float(refilled.max()) > 1.0
+
+
+def test_a_law_without_a_store_leaves_an_empty_one(arms):
+    law = PassiveCoTaPLaw(arms, LawConfig("cotap", passive=True))
+    state = at_rest(arms, 2)
+    for arm in range(2):
+        law.take_over(1, arm, {}, state.position)
+    fresh = torch.tensor([[True, True], [False, False]])
+    torque, report = law(replace(state, fresh=fresh), parameters(2))
+    plain, _ = CoTaPLaw(arms, LawConfig("cotap"))(state, parameters(2))
+    assert torch.equal(torque.stiffness, plain.stiffness)
+    assert report.values["store_energy"].tolist() == [[2.0, 2.0], [0.0, 0.0]]

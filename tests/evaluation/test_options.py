@@ -115,7 +115,7 @@ def test_a_law_reads_what_it_is_said_to_read(name, spec, rng):
     pose, force = arms.chains.pose(q), torch.tensor([5.0, -3.0, 4.0]).expand(1, 2, 3)
     state = ArmState(
         q, torch.randn(q.shape, generator=rng), q + 0.1 * torch.randn(q.shape, generator=rng), pose,
-        torch.eye(3).expand(1, 3, 3), None, force, torch.full_like(q, 0.2), torch.zeros(1, dtype=torch.bool), 0.02,
+        torch.eye(3).expand(1, 3, 3), None, force, torch.full_like(q, 0.2), torch.zeros(1, 2, dtype=torch.bool), 0.02,
     )  # fmt: skip
 
     def torque(**changed: Any) -> torch.Tensor:

@@ -75,7 +75,8 @@ class ArmState:
     target_velocity: torch.Tensor | None = None
     """(N, A, n) how fast the reference moves [rad/s]; None counts as at rest."""
     fresh: torch.Tensor | None = None
-    """(N, A) bool: the arm's law or its episode has just begun and nothing is remembered; None counts as everywhere."""
+    """(N, A) bool: the arm's law or its episode has just begun and nothing is remembered. Laws that remember something
+    cannot do without."""
     dt: float = 0.02
     """Control step [s]."""
 
@@ -133,8 +134,27 @@ class Remembering:
         self.memory: dict[str, torch.Tensor] = {}
 
     def recall(self, state: ArmState, name: str, initial: torch.Tensor) -> torch.Tensor:
-        """What was remembered under `name`, and `initial` (N, A, ...) of arms that are fresh."""
+        """What was remembered under `name`, and `initial` (N, A, ...) of arms that are fresh.
+
+        Raises:
+            ValueError: `state.fresh` is missing or has another shape.
+        """
+        if state.fresh is None or state.fresh.shape != initial.shape[:2]:
+            got = None if state.fresh is None else tuple(state.fresh.shape)
+            raise ValueError(f"fresh must have shape {tuple(initial.shape[:2])} for a law that remembers, got {got}")
         held = self.memory.get(name)
-        if held is None or state.fresh is None:
+        if held is None:
             return initial
         return torch.where(state.fresh[(..., *[None] * (initial.dim() - 2))], initial, held)
+
+    def take_over(self, env: int, arm: int, other: dict[str, torch.Tensor], like: torch.Tensor) -> bool:
+        """Go on with an arm that has moved under another law. Returns whether it is remembered, and so not fresh.
+
+        Args:
+            env: Its env.
+            arm: Which of that env's arms it is.
+            other: The memory of the law before, empty if it remembers nothing.
+            like: (N, A, n) as joint angles are.
+        """
+        del env, arm, other, like
+        return False

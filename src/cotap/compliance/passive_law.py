@@ -14,9 +14,9 @@ from cotap.compliance.passivity import EnergyStore
 class PassiveCoTaPLaw(CoTaPLaw, Remembering):
     """CoTaP's law; a change of its spring that the store cannot pay is held back.
 
-    With the joint error, the spring changes by its stiffness. With the task error, its rest moves with the pose as
-    well, and counts; that the target moves does not. Reports `store_energy`, the level [J], and `held_back`, the share
-    of the change that was not let through.
+    The spring changes by its stiffness, and by its rest: with the task error it moves with the pose. That the target
+    moves does not count. A change whose energy is not a number is not made and empties the store. Reports
+    `store_energy`, the level [J], and `held_back`, the share of the change that was not let through.
 
     Args:
         arms: What is driven.
@@ -42,29 +42,47 @@ class PassiveCoTaPLaw(CoTaPLaw, Remembering):
         }
         return torque, report
 
+    def take_over(self, env: int, arm: int, other: dict[str, torch.Tensor], like: torch.Tensor) -> bool:
+        """See `Remembering`. Goes on with the spring and the store of another passive law. Of any other law neither is
+        known, and the store begins empty."""
+        n = like.shape[-1]
+        for name, width in (("stiffness", n * n), ("damping", n * n), ("undamped", n), ("rest", n), ("store", 1)):
+            unknown = like.new_full((*like.shape[:2], width), torch.nan)
+            mine = self.memory.get(name, unknown).clone()
+            mine[env, arm] = other.get(name, unknown)[env, arm]
+            self.memory[name] = mine
+        return True
+
+    @torch.no_grad()
     def _in_force(
         self, state: ArmState, stiffness: torch.Tensor, error: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
         size = stiffness.shape[-2:]
         old = self.recall(state, "stiffness", stiffness.flatten(-2)).unflatten(-1, size)
         joint_error = state.target - state.position
-        before = error  # of the spring in force, carried along with the target
-        if self._cfg.error == "task":
-            before = joint_error + self.recall(state, "rest", error - joint_error)
-        level = self._filled(state, size)
+        rest = self.recall(state, "rest", error - joint_error)
+        before = joint_error + rest  # of the spring in force, carried along with the target
+        asked, level = stiffness, self._filled(state, size)
         room = self._store.available(level, state.dt)
         energy = spring_energy(stiffness, error) - spring_energy(old, before)
-        share = torch.ones_like(level)
-        held = (energy > room) & energy.isfinite()
+        share, known = torch.ones_like(level), energy.isfinite()
+        held = (energy > room) & known
         if held.any():
             stiffness, error = stiffness.clone(), error.clone()
             given = (x[held] for x in (old, stiffness, before, error, room))
             stiffness[held], error[held], share[held], energy[held] = held_spring(*given)
         level = self._store.drawn(level, energy)
-        self.memory["store"] = level.unsqueeze(-1)
-        if self._cfg.error == "task":
-            self.memory["rest"] = error - joint_error
-        return stiffness, error, {"store_energy": level, "held_back": 1.0 - share}
+        now = error - joint_error
+        if not known.all():
+            kept = ~known & spring_energy(old, rest).isfinite()  # there is a spring to stay with
+            stiffness = torch.where(kept[..., None, None], old, stiffness)
+            error = torch.where(kept.unsqueeze(-1), before, error)
+            now = torch.where(kept.unsqueeze(-1), rest, now)
+            share = torch.where(kept, 0.0, share)
+            level = torch.where(known, level, self._store.floor)
+        self.memory |= {"store": level.unsqueeze(-1), "rest": now}
+        ratio = _trace(stiffness) / _trace(asked)
+        return stiffness, error, {"store_energy": level, "held_back": 1.0 - share, "stiffness_ratio": ratio}
 
     def _filled(self, state: ArmState, size: torch.Size) -> torch.Tensor:
         """The store's level (N, A) once the damping of the past step is in it."""
@@ -76,7 +94,12 @@ class PassiveCoTaPLaw(CoTaPLaw, Remembering):
         moved = q - self.recall(state, "undamped", q)
         # See `passivity.damping_energy`.
         dissipated = 2.0 / state.dt * spring_energy(damping, moved)
-        return self._store.filled(level, dissipated.to(level.dtype))
+        return self._store.filled(level, torch.where(dissipated.isfinite(), dissipated, 0.0).to(level.dtype))
+
+
+def _trace(matrix: torch.Tensor) -> torch.Tensor:
+    """Of matrices (..., n, n)."""
+    return matrix.diagonal(dim1=-2, dim2=-1).sum(-1)
 
 
 def held_spring(
@@ -102,7 +125,8 @@ def held_spring(
     root = (slope.square() + 4.0 * bend * most).clamp_min(0.0).sqrt()
     tiny = torch.finfo(root.dtype).tiny
     part = torch.where(slope > 0.0, 2.0 * most / (slope + root + tiny), (root - slope) / (2.0 * bend + tiny))
-    part = torch.where(slope + bend <= most, 1.0, part.clamp(0.0, 1.0)).to(shift.dtype)
+    whole = (slope + bend <= most) | (shift == 0.0).all(-1)
+    part = torch.where(whole, 1.0, part.clamp(0.0, 1.0)).to(shift.dtype)
     reached = torch.where((part < 1.0).unsqueeze(-1), before + part.unsqueeze(-1) * shift, error)
     spent = spring_energy(old, reached) - spring_energy(old, before)
     none = spent > room

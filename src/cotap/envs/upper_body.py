@@ -144,6 +144,8 @@ class UpperBody(Stateful):
     def set_law(self, env: int, arm: int, law: LawConfig) -> None:
         """Put one arm of one env under another law, or other parameters, from the next command on.
 
+        An arm in motion takes no full energy store along: see `PassiveCoTaPLaw.take_over`.
+
         Raises:
             ValueError: a field of `law` is out of its range.
         """
@@ -154,13 +156,18 @@ class UpperBody(Stateful):
         p.null_stiffness[env, arm], p.alpha[env, arm] = law.null_stiffness, law.alpha
         if under_it[env, arm]:
             return
-        for _, _, mine in self._laws.values():
+        memory: dict[str, torch.Tensor] = {}
+        for before, _, mine in self._laws.values():
+            if mine[env, arm] and isinstance(before, Remembering):
+                memory = before.memory
             mine[env, arm] = False
         under_it[env, arm] = True
+        now, moving = self._laws[law.kind()][0], not self.fresh[env, arm]
+        known = moving and isinstance(now, Remembering) and now.take_over(env, arm, memory, self._anchor[1])
+        self.fresh[env, arm] = not known
         self.report = {}
         self._laws = {kind: driven for kind, driven in self._laws.items() if driven[2].any()}
         self.sensors.estimates = any(config.sensing == "estimated" for _, config, _ in self._laws.values())
-        self.fresh[env, arm] = True
 
     @property
     def active(self) -> bool:
