@@ -10,6 +10,7 @@ from cotap.evaluate import main
 from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.modulation import Modulation, sweep
 from cotap.evaluation.rollout import idle, record_rollout
+from cotap.evaluation.stores import StoreRecord, curve, measures, waiting
 
 
 def test_sweep_by_hand():
@@ -43,6 +44,67 @@ def test_every_arm_goes_through_the_whole_range():
     assert result["by_change"]["step"]["peak_torque"]["n"] == 2
     assert result["metrics"]["energy"]["mean"] > 0.0
     assert "recovery_s" not in result["metrics"]
+    assert "reaching" not in result  # no arm has a store
+    assert "stiffening_delay_s" not in result["metrics"]
+
+
+def test_waiting_by_hand():
+    """Asked for anew in steps 1 and 5: the first time reached after two steps, the second time never."""
+    ratio = torch.tensor([1.0, 0.5, 0.9, 0.96, 0.9, 0.5, 0.6, 0.7])
+    changed = torch.tensor([False, True, False, False, False, True, False, False])
+    steps, reached = waiting(ratio, changed)
+    assert steps.tolist() == [0.0, 2.0, 1.0, 0.0, 1.0, 3.0, 2.0, 1.0]
+    assert reached.tolist() == [True, True, True, True, False, False, False, False]
+
+
+def test_a_stores_measures_by_hand():
+    """One env of two arms, one without a store. More is asked for in step 1, less in step 4."""
+    nan = float("nan")
+    record = StoreRecord()
+    for level, held, ratio, stiffness in ((2.0, 0.0, 1.0, 10.0), (1.0, 0.5, 0.5, 20.0), (1.2, 0.0, 0.98, 39.2),
+                                          (1.4, 0.0, 1.0, 40.0), (2.0, 0.1, 1.5, 15.0)):  # fmt: skip
+        for rows, value in zip((record.level, record.held_back, record.ratio), (level, held, ratio), strict=True):
+            rows.append(torch.tensor([[value, nan]]))
+        record.stiffness.append(torch.tensor([[stiffness, 99.0]]))
+    changed = torch.zeros(5, 1, 2, dtype=torch.bool)
+    changed[[1, 4]] = True
+    counted = torch.ones(5, 1, dtype=torch.bool)
+    found, more = measures(record, changed, counted, 0.02)
+    assert more[..., 0].flatten().tolist() == [False, True, False, False, False]
+    assert not more[..., 1].any()
+    expected = {"store_energy": 7.6 / 5, "held_back": 0.12, "stiffening_delay_s": 0.02, "reached_fraction": 1.0}
+    assert {name: float(value) for name, value in found.items()} == pytest.approx(expected)
+    rows = curve(record, changed, more, 0.02, 1.0, 0)
+    assert rows["time"] == pytest.approx([0.0, 0.02, 0.04])
+    assert rows["asked"] == pytest.approx([40.0, 40.0, 40.0])
+    assert rows["in_force"] == pytest.approx([20.0, 39.2, 40.0])
+    assert rows["store_energy"] == pytest.approx([1.0, 1.2, 1.4])
+    assert rows["ratio"] == pytest.approx([0.5, 0.98, 1.0])
+    assert not measures(record, changed, counted & (torch.arange(5) > 1).unsqueeze(1), 0.02)[1].any()
+
+
+def test_a_small_store_makes_arms_wait_and_the_plot_shows_it(tmp_path):
+    protocol = Modulation(num_envs=4, pelvis="fixed", force=(0.0, 0.0, -20.0), hand="both", onset=0.5,
+                          window=(0.0, 0.8), fall_seconds=0.8, episode_seconds=1.3)  # fmt: skip
+    delays = []
+    for store in (0.05, 50.0):
+        cfg = protocol.configure(HumanoidEnvConfig(num_threads=1))
+        cfg.upper_body = LawOptions(
+            left=f"cotap:passive=true,store_energy={store},store_power=1000", right="pd"
+        ).configure()
+        env = HumanoidEnv(cfg)
+        protocol.prepare(env)
+        t = record_rollout(env, idle(env), 65, progress=False, before_step=protocol.before_step)
+        result = protocol.measure(t, env)
+        assert result["metrics"]["stiffening_delay_s"]["n"] == 2  # the envs with steps
+        assert result["metrics"]["store_energy"]["n"] == 4
+        delays.append(result["metrics"]["stiffening_delay_s"]["mean"])
+        assert len(result["reaching"]["time"]) <= 25
+    assert delays[0] > delays[1] + 0.1
+    assert delays[1] == 0.0
+    assert result["metrics"]["reached_fraction"]["mean"] == 1.0
+    protocol.plot(tmp_path / "reaching.png", result | {"protocol": "modulation", "method": "cotap"})
+    assert (tmp_path / "reaching.png").stat().st_size > 10_000
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
@@ -14,7 +15,10 @@ from cotap.envs import HumanoidEnv
 from cotap.evaluation.disturbance import ConstantLoad, window_measures
 from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.metrics import summaries
+from cotap.evaluation.report import pyplot, save_figure
 from cotap.evaluation.rollout import Trajectory
+from cotap.evaluation.stores import StoreRecord, curve
+from cotap.evaluation.stores import measures as store_measures
 
 CHANGES = ("step", "ramp", "both")
 
@@ -67,9 +71,12 @@ class Modulation(ConstantLoad):
             self.require_default("alpha_range", f"under {', '.join(laws)}")
         rng = torch.Generator().manual_seed(self.seed)
         self.phase = torch.rand(env.num_envs, len(env.spec.arms), 2, generator=rng).to(env.device)
+        self.stores, self.commands = StoreRecord(), []
 
     def before_step(self, env: HumanoidEnv, step: int) -> None:
         """Set stiffness and alpha of this step."""
+        if step:
+            self.stores.add(env)
         pace = torch.tensor([1.0, 2.0 / (1.0 + math.sqrt(5.0))], device=env.device)
         cycles = step * env.dt / self.period * pace + self.phase
         stepped = {"step": True, "ramp": False}.get(self.change)
@@ -80,6 +87,7 @@ class Modulation(ConstantLoad):
         p = env.upper_body.parameters
         p.stiffness[:] = (low + (high - low) * stiffness).exp().unsqueeze(2)
         p.alpha[:] = self.alpha_range[0] + (self.alpha_range[1] - self.alpha_range[0]) * alpha
+        self.commands.append(torch.cat((p.stiffness, p.alpha.unsqueeze(2)), 2).cpu())
 
     def measure(self, trajectory: Trajectory, env: HumanoidEnv) -> dict[str, Any]:
         """The measured part of the evaluation's JSON; with both kinds of change, also of each by itself."""
@@ -90,8 +98,13 @@ class Modulation(ConstantLoad):
         for measures in (result["metrics"], result["metrics_without_falls"]):
             for name in ("impedance_error", "load_overshoot"):
                 measures.pop(name, None)
+        steps = torch.full((env.num_envs,), self.change == "step")
         if self.change == "both":
             steps = torch.arange(env.num_envs) % 2 == 0
+        self.stores.add(env)
+        if self.stores.level:
+            self._measure_stores(result, trajectory, steps)
+        if self.change == "both":
             onset = round(self.onset / trajectory.dt)
             begin, end = (onset + round(bound / trajectory.dt) for bound in self.window)
             measures = window_measures(trajectory, begin, end, self.hit(env))
@@ -99,6 +112,44 @@ class Modulation(ConstantLoad):
                 name: summaries(measures, mask, self.seed) for name, mask in (("step", steps), ("ramp", ~steps))
             }
         return result
+
+    def _measure_stores(self, result: dict[str, Any], trajectory: Trajectory, stepped: torch.Tensor) -> None:
+        """Add what the arms' energy stores did, and the delay of steps in the envs of `stepped` (N,)."""
+        dt, commands = trajectory.dt, torch.stack(self.commands)
+        changed = torch.zeros(commands.shape[:3], dtype=torch.bool)
+        changed[1:] = (commands[1:] != commands[:-1]).any(-1) & stepped.unsqueeze(-1)
+        begin, end = (round((self.onset + bound) / dt) for bound in self.window)
+        counted = trajectory.alive()
+        counted[:begin], counted[end:] = False, False
+        found, more = store_measures(self.stores, changed, counted, dt)
+        stood = ~trajectory.fell.any(0)
+        for name, keep in (("metrics", torch.ones_like(stood)), ("metrics_without_falls", stood)):
+            result[name] |= summaries(found, keep, self.seed)
+        result["reaching"] = curve(self.stores, changed, more, dt, self.period / 2.0, self.seed)
+
+    def plot(self, path: Path, result: dict[str, Any]) -> None:
+        """With an energy store, the stiffness asked for and in force since a step to more; else as a load's."""
+        curves = result.get("reaching")
+        if not curves or not curves["time"]:
+            super().plot(path, result)
+            return
+        figure, (stiffness, share) = pyplot().subplots(1, 2, figsize=(9.5, 3.4), constrained_layout=True)
+        stiffness.plot(curves["time"], curves["asked"], color="0.6", label="asked for")
+        stiffness.plot(curves["time"], curves["in_force"], color="#2171b5", label="in force")
+        stiffness.set(ylabel="mean joint stiffness [Nm/rad]", ylim=(0.0, None))
+        stiffness.legend(frameon=False)
+        low, high = zip(*curves["ci95"], strict=True)
+        share.fill_between(curves["time"], low, high, color="#2171b5", alpha=0.3, lw=0.0)
+        share.plot(curves["time"], curves["ratio"], color="#2171b5", label="in force over asked for")
+        share.axhline(1.0, color="0.6", lw=0.8)
+        share.plot(curves["time"], curves["store_energy"], color="#238b45", label="store [J]")
+        share.set(ylim=(0.0, None))
+        share.legend(frameon=False)
+        for axis in (stiffness, share):
+            axis.set(xlabel="time since more was asked for [s]")
+            axis.grid(alpha=0.2)
+        figure.suptitle(f"{result['protocol']}, {self.mode}, {result['method']}")
+        save_figure(figure, path)
 
 
 def sweep(cycles: torch.Tensor, stepped: torch.Tensor) -> torch.Tensor:

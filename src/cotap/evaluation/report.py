@@ -22,7 +22,7 @@ UNITS = {
     "impedance_error": "m", "free_hand_error": "m", "loaded_hand_error": "m", "push_resistance": "N",
     "survival_s": "s", "position_error": "m", "yaw_error": "rad", "vibration": "rad/s^2", "j_upper_blow": "Nm",
     "elbow_amplitude": "Nm", "elbow_rms": "Nm", "elbow_peak": "Nm", "arm_rms": "Nm", "hand_swing": "m",
-    "stiffness": "N/m",
+    "stiffness": "N/m", "store_energy": "J", "stiffening_delay_s": "s",
 }  # fmt: skip
 
 LESS_IS_BETTER = (
@@ -31,10 +31,12 @@ LESS_IS_BETTER = (
     "impedance_error", "recovery_s", "settle_s",
     "transient_energy", "oscillation_energy", "overshoot", "overshoots", "load_overshoot", "stiffness_error",
     "position_error", "yaw_error", "vibration", "free_hand_error", "loaded_hand_error", "push_resistance",
+    "held_back", "stiffening_delay_s",
 )  # fmt: skip
 MORE_IS_BETTER = (
     "still_share", "episode_length_fraction", "recovered_fraction", "settled_fraction", "completed_fraction",
     "survival_s", "return", "return_free_hand_error", "return_loaded_hand_error", "return_push_resistance",
+    "reached_fraction",
 )  # fmt: skip
 """Measures of which one direction is better. Of the others neither is: a soft hand goes far, and should."""
 
