@@ -79,7 +79,7 @@ def laws_of(name: str, stiffness: float, null_stiffness: float, sensing: str = "
 class Static:
     """Downward displacement of the left hand under 10, 30 and 50 N downward, every law (paper, Table VI)."""
 
-    checkpoint: str = Options.checkpoint
+    checkpoint: str = "h1-cotap"
     """Policy (pelvis free): a file, or a shipped policy's name."""
     facet_checkpoint: str = ""
     """Policy of the row facet, which else has that of the others."""
@@ -179,7 +179,7 @@ def policy_of(options: Static | Transient, name: str) -> str:
 class Transient:
     """What a hand does after a push on it, every law (paper, Fig. 9): error over time, energy of its oscillation."""
 
-    checkpoint: str = Options.checkpoint
+    checkpoint: str = "h1-cotap"
     """Policy: a file, or a shipped policy's name."""
     facet_checkpoint: str = ""
     """Policy of the row facet, which else has that of the others."""
