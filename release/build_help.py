@@ -90,8 +90,7 @@ def options(kind: Any, default: Any) -> tuple[Option, ...]:
     found = _of_parser(parser)
     if kind in (BaseOptions, DistillOptions):
         target = {flag: option for option in found for flag in option.flags}
-        names = {s: full for s, full in SHORTCUTS.items() if s != "--robot" or kind is BaseOptions}
-        short = [replace(target[full], flags=(s,), group="") for s, full in names.items()]
+        short = [replace(target[full], flags=(s,), group="") for s, full in SHORTCUTS.items()]
         found = (*found[:4], *short, *found[4:])
     return found
 

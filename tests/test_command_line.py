@@ -51,7 +51,6 @@ def test_options_of_a_training_are_all_there():
     assert {"--num-envs", "--env.num-envs", "--robot", "--seed", "--ppo.clip", "--env.rewards.lower.foot-slip"} <= {
         *flags
     }
-    assert "--robot" not in COMMANDS["train distill"].flags()
 
 
 @pytest.mark.parametrize(
@@ -133,6 +132,13 @@ def test_first_sentences_of_options_take_two_lines_at_most(name: str):
         if not option.group:
             lines = show(name, Command("about", {}, (option,))).splitlines()[5:-2]
             assert len(lines) <= 2, "\n".join(lines)
+
+
+@pytest.mark.parametrize(
+    "name", ["train", "train base", "train distill", "evaluate tour", "export", "play", "motions import"]
+)
+def test_every_command_that_has_a_default_robot_takes_another(name: str):
+    assert any("--robot" in option.flags for option in COMMANDS[name].options)
 
 
 def test_a_name_that_resembles_nothing_gets_the_list():

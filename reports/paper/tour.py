@@ -17,7 +17,7 @@ RUNS = {"mujoco": 512, "pybullet": 50}
 """Most runs of a row by engine: a run takes twenty times as long as an env of any other test."""
 ENGINES = {"mujoco": "MuJoCo", "pybullet": "PyBullet"}
 SHORT = ["--waypoints", "4", "--episode-seconds", "20"]
-MEASURES = COLUMNS | {"vibration": ("vibration [Mrad/s²]", 1e-6)}
+MEASURES = COLUMNS | {"vibration": ("vibration [krad/s²]", 1e-3)}
 WHAT = """{length}: what happens, what is measured, and how it differs from the [benchmark]({field}) is on
 [its own page](tour.md). Arms follow the tour alone, without the policy's own arm actions; robots are nominal. PD has
 the gains of the tour (kp {kp} Nm/rad)."""
