@@ -81,6 +81,8 @@ def test_a_shipped_evaluation_is_what_the_policy_does(name: str, evaluation: str
         assert abs(after["mean"] - before["mean"]) <= 5.0 * error + 1e-9, measure
         compared += 1
     assert compared >= 10
+    if 2 * kept["num_falls"] > kept["num_envs"]:  # who falls at once has hardly a slope
+        return
     spread = 0.3 if "hand-loads" in evaluation else 0.1  # loads turn 64 robots about as fast as commands do
     for axis, slope in kept.get("slopes", {}).items():
         assert now["slopes"][axis] == pytest.approx(slope, abs=spread), axis

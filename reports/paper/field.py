@@ -58,7 +58,7 @@ def field(book: Book) -> None:
             book.row(label(book.robot, name), missing("cotap"))
             continue
         m, under = free["metrics_without_falls"], loaded["metrics_without_falls"]
-        near = (hundredfold(x.get("near_limit_share")) for x in (m, under))
+        near = (hundredfold(x.get("joints_near_limit")) for x in (m, under))
         error = hundredfold(under.get("impedance_error"), 2)
         book.row(
             label(book.robot, name), hundredfold(m["e_ee"], 2), error, *near, *(upright(r) for r in (free, loaded))

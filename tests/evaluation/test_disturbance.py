@@ -48,7 +48,7 @@ def test_measures_by_hand():
     t.torque_share[60:70, 0, 11 + 5] = 1.0  # of an arm
     m = window_measures(t, 50, 100, LEFT)
     expected = {"e_torso": 0.5, "e_ee": 0.15, "e_ee_hit": 0.2, "j_upper": 5.0, "e_upper": 0.25, "peak_torque": 4.0,
-                "share_at_limit": 0.2, "near_limit_share": (20 * 2 + 5 + 10) / (50 * 19), "energy": 3.5,
+                "share_at_limit": 0.2, "joints_near_limit": (20 * 2 + 5 + 10) / (50 * 19), "energy": 3.5,
                 "fall_fraction": 0.0}  # fmt: skip
     for name, value in expected.items():
         assert float(m[name][0]) == pytest.approx(value, abs=1e-5), name

@@ -204,7 +204,7 @@ def window_measures(t: Trajectory, begin: int, end: int, hit: list[int]) -> dict
 
     Hand errors are against the reference carried in the torso frame; `e_ee_hit` is that of the hands in `hit`. Torques
     are those at the ends of control steps, `peak_torque` the largest of any arm joint, `energy` the integral of
-    |torque x rate| over all arm joints, `near_limit_share` the share of all joints, the legs' too, near their limit.
+    |torque x rate| over all arm joints, `joints_near_limit` the share of all joints, the legs' too, near their limit.
     """
     part = replace(t, **{f.name: getattr(t, f.name)[begin:end] for f in fields(t) if f.name != "dt"})
     alive = t.alive()[begin:end]
@@ -225,7 +225,7 @@ def window_measures(t: Trajectory, begin: int, end: int, hit: list[int]) -> dict
         "e_upper": masked_mean(part.arm_error.norm(dim=2), alive),
         "peak_torque": torch.where(seen, peak, nothing),
         "share_at_limit": masked_mean((arm_share > 0.999).any(2).float(), alive),
-        "near_limit_share": masked_mean((part.torque_share > NEAR_LIMIT).float().mean(2), alive),
+        "joints_near_limit": masked_mean((part.torque_share > NEAR_LIMIT).float().mean(2), alive),
         "energy": torch.where(seen, energy, nothing),
         "fall_fraction": t.fell[:end].any(0),
     }
