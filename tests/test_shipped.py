@@ -67,13 +67,13 @@ def test_a_shipped_evaluation_is_what_the_policy_does(name: str, evaluation: str
     args = ["64" if arg == ENVS else arg for arg in EVALUATIONS[evaluation]]
     now = evaluate([*args, "--checkpoint", str(path), "--seed", "1", "--threads", "1"])
     settings = kept["settings"], json.loads(json.dumps(now["settings"]))
-    known = settings[0].keys() & settings[1].keys()  # options come and go
+    known = settings[0].keys() & settings[1].keys()  # options and measures come and go
     changed = {name for name in known if settings[0][name] != settings[1][name]}
     assert len(known) > 20
     assert changed <= {"seed", "num_envs", "env"}
     compared = 0
-    for measure, before in kept["metrics"].items():
-        after = now["metrics"][measure]
+    for measure in sorted(kept["metrics"].keys() & now["metrics"].keys()):
+        before, after = kept["metrics"][measure], now["metrics"][measure]
         if min(before["n"], after["n"]) < 20:  # such as the time that those take to recover who leave their place
             assert before["n"] < 20 * 16 or after["n"] > 0, measure
             continue
