@@ -118,7 +118,8 @@ def test_the_energy_store_takes_it_too(arms, rng):
     law = LawConfig(name="cotap", rotational_stiffness=TURNING, passive=True)
     from cotap.compliance.laws import LAWS
 
-    torque, report = LAWS["cotap"](arms, law)(state_of(arms, q, q + 0.1), parameters(40, 1.0))
+    state = replace(state_of(arms, q, q + 0.1), fresh=torch.ones(40, 2, dtype=torch.bool))
+    torque, report = LAWS["cotap"](arms, law)(state, parameters(40, 1.0))
     assert torch.isfinite(torque.elastic).all()
     assert "store_energy" in report.values
 
