@@ -232,8 +232,8 @@ def a_result() -> dict[str, Any]:
         "right": dict.fromkeys(sim_to_sim.SWINGS),
     }  # fmt: skip
     one = {
-        "velocity-tracking": fell | {"metrics": {"e_lin": some}}, "impact": {"PD": law | {"curve": [0.1, 0.2, 0.4]}},
-        "constant-load": {"PD": law | {"curve": []}}, "periodic-load": {"time": [0.0, 0.02], "arms": arms},
+        "velocity-tracking": fell | {"metrics": {"e_lin": some}}, "impact": {"K 100": law | {"curve": [0.1, 0.2, 0.4]}},
+        "constant-load": {"K_z 100": law | {"curve": []}}, "periodic-load": {"time": [0.0, 0.02], "arms": arms},
         "perturbations": {"late": fell},
     }  # fmt: skip
     return {"dt": 0.02, "settings": {"motion": "mixture"}, "engines": {"mujoco": one}}
@@ -248,9 +248,9 @@ def test_the_report_has_every_number_in_its_place():
         "| trials that fell | 2 of 20 (3 to 30 %) |",
         f"| e_lin | {shown} |",
         "## Impact of 500 N for 0.05 s, left hand, stance, arms moving (mixture)", head,
-        f"| mujoco | PD | 2 of 20 (3 to 30 %) | {shown} | - | {shown} | - |",
+        f"| mujoco | K 100 | 2 of 20 (3 to 30 %) | {shown} | - | {shown} | - |",
         "## Constant load of -50 N, left hand, stance, arms held", head,
-        f"| mujoco | PD | 2 of 20 (3 to 30 %) | {shown} | - | {shown} | - |",
+        f"| mujoco | K_z 100 | 2 of 20 (3 to 30 %) | {shown} | - | {shown} | - |",
         "## Periodic load of 30 N, 4 s, both hands, arms held: left alpha 0.7 at 500 N/m, right PD",
         "| engine | arm | elbow torque [Nm] | of it statics | hand swing [m] | of it statics |",
         "| mujoco | left | 6.000 | 5.000 | 0.050 | - |", "| mujoco | right | - | - | - | - |",
@@ -304,6 +304,8 @@ def test_the_figure_draws_errors_from_the_onset_on_and_torques_about_statics(tmp
     figure(result, tmp_path / "x.png")
     impact, load, periodic_load = kept[0].axes
     assert [axis.get_title() for axis in (impact, load)] == ["mujoco, impact", "mujoco, constant-load"]
+    named = [[text.get_text() for text in axis.get_legend().get_texts()] for axis in (impact, load)]
+    assert named == [["K 100"], ["K_z 100"]]  # each part has laws of its own
     np.testing.assert_allclose(impact.lines[0].get_xydata(), [[-0.5, 0.1], [-0.48, 0.2], [-0.46, 0.4]])
     drawn = [line.get_ydata() for line in periodic_load.lines]
     np.testing.assert_allclose(drawn, [[0.0, 2.0], [-6.0] * 2, [8.0] * 2, [1.0, 3.0], [-3.0] * 2, [7.0] * 2])

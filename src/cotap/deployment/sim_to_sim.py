@@ -355,7 +355,7 @@ def figure(result: dict[str, Any], path: Any) -> None:
             for label, law in e[part].items():
                 axis.plot(result["dt"] * np.arange(len(law["curve"])) - 0.5, law["curve"], label=label, lw=1.2)
             axis.set(title=f"{name}, {part}", xlabel="time since the onset [s]", ylabel="error of the hand hit [m]")
-        column[0].legend(frameon=False, fontsize=9)
+            axis.legend(frameon=False, fontsize=9)
         p, axis = e["periodic-load"], column[2]
         styles = (("right", "PD", "#d95f02", "-"), ("left", "alpha 0.7, 500 N/m", "#2171b5", "--"))
         for side, law, color, style in styles:  # the second, dashed, lets the first be seen
