@@ -42,7 +42,8 @@ class Exciters:
     where the hand is and how fast it moves at every control step.
 
     Args:
-        genes: (N, GENES) any numbers; of the order of 1.
+        genes: (N, GENES) any numbers; of the order of 1. Zeros are an exciter that is good already: it pulls straight
+            with three quarters of the force for most of the time, all axes are as stiff, and alpha stays as it is.
         command: (N,) index into `COMMANDS`.
         natural: (N,) natural angular frequency of the hand at the mean stiffness [rad/s].
         limits: The same for all.
@@ -56,15 +57,16 @@ class Exciters:
         self._direction = _unit(g[:, _DIRECTION])
         across = g[:, _ACROSS]
         self._across = _unit(across - (across * self._direction).sum(1, keepdim=True) * self._direction)
-        self._circle = g[:, _CIRCLE, None].clamp(0.0, 1.0)
-        self._size = limits.force * g[:, _SIZE].sigmoid()
+        self._circle = (g[:, _CIRCLE, None] - 1.0).clamp(0.0, 1.0)
+        self._size = limits.force * (1.0 + g[:, _SIZE]).sigmoid()
         slowest, fastest = math.pi / limits.seconds, 2.0 * natural
         self._rate = slowest * (fastest / slowest) ** g[:, _RATE].sigmoid()
         self._spin = 2.0 * slowest * (fastest / slowest) ** g[:, _SPIN].sigmoid()
         self._phase, self._brake = math.pi * g[:, _PHASE], limits.brake * g[:, _BRAKE].sigmoid()
-        self._last = limits.seconds * g[:, _LAST].sigmoid()
+        self._last = limits.seconds * (2.0 + g[:, _LAST]).sigmoid()
         self._ratio, self._shift = natural * 2.0 ** g[:, _RATIO].tanh(), math.pi * g[:, _SHIFT]
-        self._depth, self._alpha = (1.0 + 2.0 * g[:, _DEPTH]).clamp(-1.0, 1.0), g[:, _ALPHA].clamp(-1.0, 1.0)
+        self._depth, alpha = (3.0 + 2.0 * g[:, _DEPTH]).clamp(-1.0, 1.0), g[:, _ALPHA]
+        self._alpha = (alpha - alpha.clamp(-1.0, 1.0)).clamp(-1.0, 1.0)
         self._way, self._far = g[:, _WAY], g[:, _FAR]
         self._rng = torch.Generator().manual_seed(seed)
         self._held = torch.zeros_like(self._size)
