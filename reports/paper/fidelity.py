@@ -70,7 +70,8 @@ def upper_agent(book: Book, envs: int) -> None:
         "share of the arm actions", "e_upper [rad]", "change from none", "mean over poses, worst of x / y / z",
         "single hands: median, 95 % within",
     )  # fmt: skip
-    points, found = [], None
+    points: list[tuple[str, float, float]] = []
+    changes: dict[str, dict[str, Any]] = {}
     for share, options in SHARES.items():
         name = "walking-300-1" if share == "1" else f"walking-300-1-arms-{share}"  # the first is the walk's, too
         track = book.run(name, "cotap", "velocity-tracking", *TRACKING, *options, envs=tracked)
@@ -80,17 +81,17 @@ def upper_agent(book: Book, envs: int) -> None:
             book.row(share, missing("cotap"))
             continue
         raw = book.results["walking-300-1-arms-0"]
-        found = relative_change(raw["per_env"], track["per_env"], "e_upper")
+        changes[share] = relative_change(raw["per_env"], track["per_env"], "e_upper")
         e_upper, single = track["metrics"]["e_upper"], felt["error_quantiles"]
         book.row(
-            share, number(e_upper), "-" if share == "0" else relative(found),
+            share, number(e_upper), "-" if share == "0" else relative(changes[share]),
             " / ".join(worst(felt["fidelity"], axis) for axis in "xyz"),
             single_hands(single, felt["error_quantiles_ci95"]),
         )  # fmt: skip
         if single and single["95"] is not None and e_upper["mean"] is not None:
             points.append((share, e_upper["mean"], 100.0 * single["95"]))
-    if found is not None:
-        book.paragraph(VERDICT, least=BETTER, found=verdict(found))
+    if "1" in changes:
+        book.paragraph(VERDICT, least=BETTER, found=verdict(changes["1"]))
     if points:
         caption = "Tracking of moving references against the felt stiffness, by the share of the policy's arm actions."
         plot_trade_off(book.figure("upper_agent", caption), points)
