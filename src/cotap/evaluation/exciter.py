@@ -7,6 +7,10 @@ from dataclasses import dataclass
 
 import torch
 
+from cotap.compliance.dynamics import joint_inertia
+from cotap.compliance.interface import Arms
+from cotap.compliance.kinematics import ChainPose
+
 COMMANDS = ("constant", "sine", "steps", "random", "knowing")
 """How stiffness and alpha are commanded: not at all; swinging or jumping at 0.5 to 2 times the natural frequency of the
 hand; drawn anew as often; by where the hand is, where it goes, and whether it is pulled or braked."""
@@ -31,6 +35,13 @@ class Limits:
     """Softest and stiffest that may be commanded [N/m]."""
     seconds: float
     """How long they have [s]."""
+
+
+def natural_frequency(arms: Arms, pose: ChainPose, stiffness: float) -> torch.Tensor:
+    """Natural angular frequency (N, A) [rad/s] of hands of a stiffness [N/m], mean over directions."""
+    jacobian = arms.chains.jacobian(pose)
+    mobility = jacobian @ torch.linalg.solve(joint_inertia(arms.inertias, pose), jacobian.transpose(-1, -2))
+    return (stiffness * mobility.diagonal(dim1=-2, dim2=-1).mean(-1)).sqrt()
 
 
 class Exciters:
@@ -64,7 +75,9 @@ class Exciters:
         self._spin = 2.0 * slowest * (fastest / slowest) ** g[:, _SPIN].sigmoid()
         self._phase, self._brake = math.pi * g[:, _PHASE], limits.brake * g[:, _BRAKE].sigmoid()
         self._last = limits.seconds * (2.0 + g[:, _LAST]).sigmoid()
-        self._ratio, self._shift = natural * 2.0 ** g[:, _RATIO].tanh(), math.pi * g[:, _SHIFT]
+        self.frequency = natural * 2.0 ** g[:, _RATIO].tanh()
+        """(N,) at which it swings or switches what it commands, where it does so by the clock [rad/s]."""
+        self._shift = math.pi * g[:, _SHIFT]
         self._depth, alpha = (3.0 + 2.0 * g[:, _DEPTH]).clamp(-1.0, 1.0), g[:, _ALPHA]
         self._alpha = (alpha - alpha.clamp(-1.0, 1.0)).clamp(-1.0, 1.0)
         self._way, self._far = g[:, _WAY], g[:, _FAR]
@@ -96,8 +109,8 @@ class Exciters:
 
     def _level(self, time: float, offset: torch.Tensor, velocity: torch.Tensor) -> torch.Tensor:
         """(N,) in [-1, 1]: how far from their mean the commands are."""
-        wave = torch.sin(self._ratio * time + self._shift)
-        turn = torch.floor(self._ratio * time / math.pi)  # two draws in a period
+        wave = torch.sin(self.frequency * time + self._shift)
+        turn = torch.floor(self.frequency * time / math.pi)  # two draws in a period
         drawn = 2.0 * torch.rand(len(turn), generator=self._rng).to(turn.device) - 1.0
         self._held, self._turn = torch.where(turn == self._turn, self._held, drawn), turn
         going_out = (offset * velocity).sum(1) / (offset.norm(dim=1) * velocity.norm(dim=1)).clamp_min(1e-6)

@@ -12,11 +12,10 @@ from tqdm import tqdm
 
 from cotap.agents.actors import as_dict
 from cotap.checks import require_one_of, require_positive_int, require_range
-from cotap.compliance.dynamics import joint_inertia
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.scripted_forces import ForceProfile
 from cotap.envs.state import RobotState
-from cotap.evaluation.exciter import COMMANDS, GENES, Exciters, Limits, next_generation
+from cotap.evaluation.exciter import COMMANDS, GENES, Exciters, Limits, natural_frequency, next_generation
 from cotap.evaluation.law_options import LawOptions, parse_law
 from cotap.evaluation.metrics import summarize
 from cotap.evaluation.protocol import HELD, mirrored_pose, select_motion
@@ -200,7 +199,8 @@ class Passivity(Stance):
         obs = env.get_observations()
         limits = Limits(self.force_size, self.brake, self.stiffness_range, self.episode_seconds)
         way, arms = self.group // len(self.compared), len(env.spec.arms)
-        exciters = Exciters(genes.to(env.device), way, self._natural(env), limits, self.seed)
+        natural = natural_frequency(env.upper_body.arms, env.state.arms, self._mean)[:, 0]
+        exciters = Exciters(genes.to(env.device), way, natural, limits, self.seed)
         tally, frames, first_alpha = Tally.empty(env.num_envs, env.device), [], env.upper_body.parameters.alpha
         for step in range(round(self.episode_seconds / env.dt)):
             offset_h, velocity_h = _hand(env)
@@ -219,13 +219,6 @@ class Passivity(Stance):
     def _mean(self) -> float:
         """The mean stiffness [N/m]."""
         return math.sqrt(math.prod(self.stiffness_range))
-
-    def _natural(self, env: HumanoidEnv) -> torch.Tensor:
-        """Natural angular frequency (N,) [rad/s] of the left hand at the mean stiffness, mean over directions."""
-        arms, pose = env.upper_body.arms, env.state.arms
-        jacobian = arms.chains.jacobian(pose)[:, 0]
-        mobility = jacobian @ torch.linalg.solve(joint_inertia(arms.inertias, pose)[:, 0], jacobian.transpose(1, 2))
-        return (self._mean * mobility.diagonal(dim1=1, dim2=2).mean(1)).sqrt()
 
     def table(self, result: dict[str, Any]) -> str:
         """Energy drawn, law by law and command by command, as Markdown."""
