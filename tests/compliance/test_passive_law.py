@@ -152,6 +152,19 @@ def test_a_store_that_can_pay_changes_nothing(arms, rng):
     assert float(level.min()) < 1e6
 
 
+@pytest.mark.parametrize("error", ["joint", "task"])
+def test_where_no_change_is_commanded_the_store_as_it_is_by_default_changes_nothing(arms, error, rng):
+    """Not a bit of it, though the pose changes the stiffness at every step."""
+    cfg, state = LawConfig("cotap", error=error, passive=True), rng.get_state()
+    drawn, level, held_back = pulled(arms, PassiveCoTaPLaw(arms, cfg), 4, 90, constant, rng)
+    rng.set_state(state)
+    plain, _, _ = pulled(arms, CoTaPLaw(arms, cfg), 4, 90, constant, rng)
+    assert torch.equal(drawn, plain)
+    assert float(held_back.max()) == 0.0
+    assert float(level.min()) < 2.0
+    assert float(drawn.abs().max()) > 0.1
+
+
 def test_a_moving_reference_fills_no_store_by_damping_that_does_not_act(arms):
     """Critical damping acts on the rate at which joints leave their reference: following it dissipates nothing."""
     cfg = LawConfig("cotap", passive=True, store_energy=1.0)
