@@ -2,7 +2,7 @@
 
 python -m reports.passive_arms --output docs/laws
 
-Writes passive_arms.md and passive_arms.json there. Needs no policy and no engine. A search lets exciters loose on
+Writes passive_arms.json and passive_arms.md there. Needs no policy and no engine. A search lets exciters loose on
 CoTaP's law with a store; then the best of them do the same to the law without.
 """
 
