@@ -37,7 +37,8 @@ class Options:
     every_samples: float = 5e6
     """Samples between the checkpoints that are evaluated. The first and the last one always are."""
     protocols: tuple[str, ...] = ("velocity-tracking",)
-    """velocity-tracking, which tells slopes and falls, and tour, which tells survival."""
+    """velocity-tracking, which tells slopes and falls; push, which tells falls of standing robots whose base is pushed
+    by 25 N s in random directions; and tour, which tells survival."""
     num_envs: int = 256
     """Envs of each evaluation."""
     seed: int = 0
@@ -71,25 +72,33 @@ def _tracking(result: dict[str, Any]) -> dict[str, float | None]:
     return result["slopes"] | {"falls": result["num_falls"] / result["num_envs"]}
 
 
+def _push(result: dict[str, Any]) -> dict[str, float | None]:
+    return {"falls_pushed": result["num_falls"] / result["num_envs"]}
+
+
 def _tour(result: dict[str, Any]) -> dict[str, float | None]:
     return {name: result["metrics"][name]["mean"] for name in ("survival_s", "completed_fraction")}
 
 
 MEASURES: dict[str, Callable[[dict[str, Any]], dict[str, float | None]]] = {
     "velocity-tracking": _tracking,
+    "push": _push,
     "tour": _tour,
 }
 """What is taken from an evaluation by each protocol."""
+COMMANDS: dict[str, list[str]] = {"push": ["impact", "--place=base", "--force", "500", "0", "0", "--random-direction"]}
+"""How `cotap evaluate` is asked for those that are no protocol by that name."""
 COLUMNS = {
     "slope_x": "slope x",
     "slope_y": "slope y",
     "slope_yaw": "slope yaw",
     "slope_height": "slope height",
     "falls": "share that fell",
+    "falls_pushed": "share that fell when pushed",
     "survival_s": "survival in the tour [s]",
     "completed_fraction": "share that completed the tour",
 }
-PLOTTED = ("slope_x", "falls", "survival_s")
+PLOTTED = ("slope_x", "falls", "falls_pushed", "survival_s")
 
 
 def checkpoints(run: str) -> list[Row]:
@@ -131,7 +140,9 @@ def measure(row: Row, options: Options, kept: list[Row]) -> Row:
             arguments = {"checkpoint": path, "num-envs": options.num_envs, "seed": options.seed}
             arguments["threads"] = options.threads
             with contextlib.redirect_stdout(io.StringIO()):
-                result = evaluate([protocol, *(f"--{name}={value}" for name, value in arguments.items())])
+                result = evaluate(
+                    [*COMMANDS.get(protocol, [protocol]), *(f"--{name}={value}" for name, value in arguments.items())]
+                )
             row["measures"][protocol] = MEASURES[protocol](result)
     return row
 

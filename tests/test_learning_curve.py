@@ -33,7 +33,8 @@ def run(tmp_path, monkeypatch) -> Path:
     def evaluate(arguments: list[str]) -> dict[str, Any]:
         with (tmp_path / "asked").open("a") as log:
             log.write(" ".join(arguments) + "\n")
-        millions = int(arguments[1].rpartition("_")[2].removesuffix(".pt")) // 25
+        (checkpoint,) = (argument for argument in arguments if argument.startswith("--checkpoint="))
+        millions = int(checkpoint.rpartition("_")[2].removesuffix(".pt")) // 25
         if arguments[0] == "tour":
             return {"metrics": {name: {"mean": 10.0 * millions} for name in ("survival_s", "completed_fraction")}}
         slopes = {f"slope_{axis}": SLOPES[millions] for axis in ("x", "y", "yaw")} | {"slope_height": None}
@@ -75,6 +76,14 @@ def test_survival_is_that_of_the_tour(run):
     assert [row["measures"]["tour"]["survival_s"] for row in content["rows"]] == [10.0, 20.0, 30.0]
     assert f"| {run} | 3.0 | 0.60 | 30.000 | 30.000 |" in page
     assert "first checkpoint" not in page
+
+
+def test_pushed_robots_stand_and_are_struck_on_the_base(run):
+    content, page, asked = report(run, "--protocols", "push", "--every-samples", "2e6")
+    assert asked[0].startswith("impact --place=base --force 500 0 0 --random-direction --checkpoint=")
+    assert [row["measures"]["push"]["falls_pushed"] for row in content["rows"]] == [0.0, 0.08, 0.01]
+    assert "| share that fell when pushed |" in page
+    assert f"| {run} | 2.0 | 0.40 | 0.080 |" in page
 
 
 def test_what_was_evaluated_is_kept_if_it_is_asked_for(run):
@@ -138,7 +147,7 @@ def test_a_slope_that_cannot_be_measured_is_no_goal():
     [
         (["none"], "run directory 'none' has no checkpoint_*.pt"),
         (["run", "--every-samples", "0"], "every_samples must lie in"),
-        (["run", "--protocols", "impact"], "protocols 'impact' is unknown; known: tour, velocity-tracking"),
+        (["run", "--protocols", "impact"], "protocols 'impact' is unknown; known: push, tour, velocity-tracking"),
         (["run", "--num-envs", "0"], "num_envs must be"),
         (["run", "--falls", "2"], "falls must lie in"),
         (["run", "--reuse"], "learning_curve.json' is no report of learning curves"),
@@ -162,7 +171,9 @@ def test_checkpoints_of_a_training_are_evaluated(tmp_path):
     run.mkdir()
     save_random_policy(run / "checkpoint_000001.pt")
     out = tmp_path / "out"
-    assert main([str(run), "--output", str(out), "--num-envs", "2", "--threads", "1"]) == 0
+    protocols = ["--protocols", "velocity-tracking", "push"]
+    assert main([str(run), "--output", str(out), "--num-envs", "2", "--threads", "1", *protocols]) == 0
     (row,) = json.loads((out / "learning_curve.json").read_text())["rows"]
     assert row["measures"]["velocity-tracking"]["falls"] == 1.0  # nobody has learned to stand
+    assert row["measures"]["push"]["falls_pushed"] == 1.0
     assert "not reached" in (out / "learning_curve.md").read_text()
