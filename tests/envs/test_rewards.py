@@ -169,12 +169,16 @@ CASES = [
     ("track_velocity", {"torso_linear_velocity_h": [[0.5, -0.2, 9.0]]}, 1.0),
     ("track_velocity_closely", {"velocity_h": [[0.6, -0.2]]}, math.exp(-0.01 / 0.04)),
     ("track_mean_velocity", {"mean_error": [[0.1, -0.05, 9.0]]}, 1.0 - math.sqrt(0.01 + 0.0025) / 0.25),
+    ("track_mean_velocity", {"mean_error": [[0.0, 0.45, 0.0]]}, 1.0 - 0.45 / 0.25),
+    ("track_mean_velocity", {"mean_error": [[0.3, -0.5, 0.0]]}, -1.0),  # bounded
     ("track_mean_yaw_rate", {"mean_error": [[9.0, 9.0, -0.1]]}, 1.0 - 0.1 / 0.3),
+    ("track_mean_yaw_rate", {"mean_error": [[0.0, 0.0, 0.7]]}, -1.0),
     ("track_yaw_rate", {"yaw_rate": [0.1]}, math.exp(-0.09)),
     ("track_yaw_rate_closely", {"yaw_rate": [0.3]}, math.exp(-0.01 / 0.06)),
     ("track_yaw_rate_closely", {"yaw_rate": [0.5]}, math.exp(-0.01 / 0.06)),
     ("track_height", {"torso_pos_w": [[3.0, -2.0, 0.96]]}, 1.0 - 0.04 / 0.15),
     ("track_height", {"torso_pos_w": [[3.0, -2.0, 1.03]]}, 1.0 - 0.03 / 0.15),
+    ("track_height", {"torso_pos_w": [[3.0, -2.0, 0.6]]}, -1.0),
     # Standing 0.1 m behind the middle of the feet, heading to (0.05, -0.06) m of it.
     ("capture_point", {**STANDING, "torso_pos_w": [[2.9, -2.0, HEIGHT]]}, math.exp(-(0.05**2 + 0.06**2) / 0.01)),
     ("capture_point", {**STANDING, "heading_w": matrix_about_z(math.pi / 2)}, math.exp(-(0.06**2 + 0.15**2) / 0.01)),

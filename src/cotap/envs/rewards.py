@@ -126,6 +126,12 @@ def _velocity_error(s: StepRecord) -> torch.Tensor:
     return (s.command.velocity_h - s.state.torso_linear_velocity_h[:, :2]).square().sum(1)
 
 
+def _linear(error: torch.Tensor, none_at: float) -> torch.Tensor:
+    """One where there is no error, none at `none_at`, and minus one from twice that on. Without this bound, robots that
+    step to catch themselves lose more than those that do not, and the H1 did not learn to."""
+    return 1.0 - (error / none_at).clamp_max(2.0)
+
+
 def _limit_excess(s: StepRecord, joints: slice) -> torch.Tensor:
     """By how much joints exceed their soft limits [rad]."""
     q, low, high = s.state.joint_pos[:, joints], s.scales.joint_low[joints], s.scales.joint_high[joints]
@@ -174,7 +180,7 @@ class LowerRewards:
     def track_mean_velocity(s: StepRecord) -> torch.Tensor:
         """Velocity averaged over a stride, so that swaying is no reason to walk too slowly: one at its command, none at
         0.25 m/s off. Linear: a kernel is flat for the slow walk that robots begin with."""
-        return 1.0 - s.mean_error[:, :2].norm(dim=1) / 0.25
+        return _linear(s.mean_error[:, :2].norm(dim=1), 0.25)
 
     @term(1.0)
     def track_yaw_rate(s: StepRecord) -> torch.Tensor:
@@ -190,13 +196,13 @@ class LowerRewards:
     def track_mean_yaw_rate(s: StepRecord) -> torch.Tensor:
         """Yaw rate averaged over a stride, so that robots that twist with every step are paid for turning all the same:
         one at its command, none at 0.3 rad/s off."""
-        return 1.0 - s.mean_error[:, 2].abs() / 0.3
+        return _linear(s.mean_error[:, 2].abs(), 0.3)
 
     @term(4.5)
     def track_height(s: StepRecord) -> torch.Tensor:
         """Height of the torso link against its command: one at it, none at 0.15 m off. Linear: a kernel is flat for
         robots that do not squat yet."""
-        return 1.0 - (s.command.height - s.state.height).abs() / 0.15
+        return _linear((s.command.height - s.state.height).abs(), 0.15)
 
     @term(0.75)
     def capture_point(s: StepRecord) -> torch.Tensor:
