@@ -21,7 +21,8 @@ _ITERATIONS = 40
 _LINEARIZATIONS = 2
 """Iterations with derivatives of their own, which takes most of the time: what the second order needs."""
 _AT_REST = 1e-9
-"""Square of a step's motion below which its energy needs no correction: what is missed is far below rounding."""
+"""Square of a step's motion below which its energy is not corrected: rounding would spoil it, and what is missed is of
+third order."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ class Pulled:
             q, p = q + step_q, p + step_p
             if max(float(step_q.abs().max()), float(step_p.abs().max())) < _SOLVED:
                 return Motion(q, p)
-        raise ArithmeticError(f"steps of {seconds:g} s are too long for this arm: shorten them")
+        raise ArithmeticError(f"steps of {seconds:g} s are too long for this arm: raise --substeps")
 
     @torch.enable_grad()
     def _gradient(self, angle: torch.Tensor, momentum: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import sys
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -240,16 +241,14 @@ def main(argv: list[str] | None = None) -> int:
         options.check()
         output = Path(options.output)
         output.mkdir(parents=True, exist_ok=True)
-        rows = {
-            f"{robot.upper()}, {damping}": measure(robot, damping, options)
-            for robot in options.robots
-            for damping in options.dampings
-        }
-        result = {"settings": to_plain(options), "rows": rows}
-        write_json(output / "passive_arms.json", result)
+        settings = {name: value for name, value in to_plain(options).items() if name != "output"}
+        result: dict[str, Any] = {"settings": settings, "rows": {}}
+        for robot, damping in product(options.robots, options.dampings):
+            result["rows"][f"{robot.upper()}, {damping}"] = measure(robot, damping, options)
+            write_json(output / "passive_arms.json", result)  # a row takes long
         text = table(result) + "\n"
         write_atomically(output / "passive_arms.md", lambda p: p.write_text(text, encoding="utf-8"))
-    except (ValueError, OSError) as error:
+    except (ValueError, ArithmeticError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     print(text, end="")

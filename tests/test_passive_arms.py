@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 import torch
 
 from cotap.compliance.dynamics import joint_inertia
 from cotap.compliance.interface import TorqueLaw
+from cotap.compliance.laws import LawConfig
 from cotap.robots import ROBOTS
 from cotap.robots.chains import arm_model
 from reports import passive_arms
@@ -114,8 +116,30 @@ def own_energy(arms, law, motion):
 
 def test_a_step_that_cannot_be_solved_is_said(pulled):
     arms, law, force, motion = pulled
-    with pytest.raises(ArithmeticError, match="steps of 5 s are too long"):
+    with pytest.raises(ArithmeticError, match="steps of 5 s are too long for this arm: raise --substeps"):
         Pulled(arms, law, force).after(motion, 5.0)
+
+
+@pytest.mark.parametrize(("factor", "met"), [(1.0, 1.0), (0.2, 1.0), (5.0, 0.0)])
+def test_the_rate_condition_allows_to_soften_and_not_to_stiffen_at_once(pulled, factor, met):
+    arms, law, _, motion = pulled
+    bench = passive_arms.Bench(arms, LawConfig("cotap"), motion.angle, passive_arms.Options())
+    after = replace(law, stiffness=factor * law.stiffness)
+    assert bench._meets(arms.chains.pose(motion.angle), after, law).tolist() == [met] * law.anchor[..., 0].numel()
+
+
+def test_a_step_too_long_ends_the_report_with_what_was_measured(tmp_path, monkeypatch, capsys):
+    def measure(robot, damping, options):
+        if damping == "critical":
+            raise ArithmeticError("steps are too long")
+        return {"robot": robot, "exciters": options.exciters}
+
+    monkeypatch.setattr(passive_arms, "measure", measure)
+    assert passive_arms.main(["--robots", "h1", "--dampings", "pd", "critical", "--output", str(tmp_path)]) == 2
+    assert "error: steps are too long" in capsys.readouterr().err
+    content = json.loads((tmp_path / "passive_arms.json").read_text())
+    assert content["rows"] == {"H1, pd": {"robot": "h1", "exciters": 2000}}
+    assert "output" not in content["settings"]
 
 
 @pytest.mark.slow
