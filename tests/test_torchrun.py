@@ -55,6 +55,27 @@ def test_two_processes_train_one_policy_and_go_on_exactly(tmp_path: Path):
         assert steps(tmp_path / folder) == [32 * i for i in range(1, 6)]
 
 
+ENDS = """
+import os, sys
+from pathlib import Path
+from cotap.train import main
+status = main(sys.argv[1:])
+print("threads:", *(task.joinpath("comm").read_text().strip() for task in Path("/proc/self/task").iterdir()))
+sys.exit(status)
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="reads Linux's list of threads")
+def test_no_thread_of_the_group_outlives_it(tmp_path: Path):
+    script = tmp_path / "ends.py"
+    script.write_text(ENDS)
+    train = command(tmp_path / "run", 1)[len(LAUNCH) + 2 :]
+    result = run([*LAUNCH, str(script), *train])
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.count("threads:") == 2
+    assert "gloo" not in result.stdout
+
+
 def ranks_of(launcher: int) -> list[int]:
     """Processes that train, as the system lists them."""
     children = Path(f"/proc/{launcher}/task/{launcher}/children").read_text().split()

@@ -81,6 +81,10 @@ class Ranks:
         if self.size == 1:
             yield
             return
+        # Optimisers load it, and its functions' defaults keep the group that exists then: gloo's threads would outlive
+        # the group, and abort the process when Python ends.
+        import torch.distributed.nn.functional
+
         on_cards = torch.device(device).type == "cuda"
         if on_cards:
             torch.cuda.set_device(self.local_rank)
