@@ -70,7 +70,8 @@ class CommandSource(Stateful):
     """Random commands, held for a random time. `override` puts fixed ones in their place.
 
     What is commanded approaches what was drawn at limited rates, as a pilot's stick does. A robot that is asked to
-    stand slows down and walks on the spot for a stride: then the stand flag is raised, once both feet should be down.
+    stand slows down and walks on the spot for a stride: then the stand flag is raised, once both feet should be down;
+    where the gait rested at once, robots fell.
     A velocity source (such as the torso-position impedance) may replace the velocities at every step.
     """
 
