@@ -59,7 +59,8 @@ def percent(result: dict[str, Any]) -> dict[str, Any]:
 
 def slope(axis: str) -> Callable[[dict[str, Any]], dict[str, Any]]:
     """Measured over commanded, of all robots together."""
-    return lambda result: {"mean": result["slopes"][f"slope_{axis}"], "ci95": None}
+    name = f"slope_{axis}"
+    return lambda result: {"mean": result["slopes"][name], "ci95": result.get("slopes_ci95", {}).get(name)}
 
 
 def most(value: float) -> tuple[float, float]:

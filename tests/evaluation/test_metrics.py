@@ -10,10 +10,10 @@ from cotap.evaluation.metrics import (
     masked_mean,
     moving_average,
     settled,
-    slope,
     steps_since_change,
     summaries,
     summarize,
+    summarize_slope,
     swings,
     tracking_measures,
     tracking_slopes,
@@ -126,7 +126,7 @@ def test_a_robot_that_ignores_its_command_is_seen_to():
                 "e_yaw_gait": [0.3, 0.3, 0.0], "e_height": [math.nan, math.nan, 0.2]}  # fmt: skip
     for name, values in expected.items():
         assert m[name].tolist() == pytest.approx(values, abs=1e-5, nan_ok=True), name
-    assert tracking_slopes(t, 0.8)["slope_x"] == pytest.approx(0.0, abs=1e-6)
+    assert tracking_slopes(t, 0.8)["slope_x"]["mean"] == pytest.approx(0.0, abs=1e-6)
     assert float(m["stand_drift"][2]) == pytest.approx(0.3)
     assert float(m["still_share"][2]) == 0.0
     t.velocity.zero_()  # it no longer moves, and steps in place
@@ -144,7 +144,7 @@ def test_heights_are_measured_of_those_who_are_asked_to_stand(share, error):
     m = tracking_measures(t, 0.8)
     assert float(m["e_height"].nanmean()) == pytest.approx(error, abs=1e-6)
     assert m["e_height"][2:].isnan().all()
-    assert tracking_slopes(t, 0.8)["slope_height"] == pytest.approx(share, abs=1e-5)
+    assert tracking_slopes(t, 0.8)["slope_height"]["mean"] == pytest.approx(share, abs=1e-5)
 
 
 @pytest.mark.parametrize("asked", ["walk", "stand"])
@@ -188,11 +188,11 @@ def test_gait_errors_and_slopes_wait_for_an_average_that_holds_nothing_of_the_co
     for name in ("e_lin", "e_yaw", "e_lin_gait", "e_yaw_gait"):
         assert m[name].tolist() == pytest.approx([0.0] * 3, abs=1e-6), name
     slopes = tracking_slopes(t, 0.8, settle_s=1.0)
-    assert (slopes["slope_x"], slopes["slope_yaw"]) == pytest.approx((1.0, 1.0), abs=1e-6)
+    assert (slopes["slope_x"]["mean"], slopes["slope_yaw"]["mean"]) == pytest.approx((1.0, 1.0), abs=1e-6)
     sooner = tracking_measures(t, 0.8, settle_s=0.9)
     for name in ("e_lin", "e_yaw", "e_lin_gait", "e_yaw_gait"):
         assert (sooner[name] > 1e-4).all(), name
-    assert tracking_slopes(t, 0.8, settle_s=0.9)["slope_x"] < 0.9999
+    assert tracking_slopes(t, 0.8, settle_s=0.9)["slope_x"]["mean"] < 0.9999
 
 
 def test_slopes_are_of_robots_that_are_asked_to_walk_and_have_not_fallen():
@@ -201,7 +201,7 @@ def test_slopes_are_of_robots_that_are_asked_to_walk_and_have_not_fallen():
     t.velocity[..., 0] = torch.tensor([-0.4, 0.8, 9.0, 0.7])
     t.fell[0, 2] = True
     t.stand[:, 3] = True
-    assert tracking_slopes(t, 0.8)["slope_x"] == pytest.approx(0.8, rel=1e-5)
+    assert tracking_slopes(t, 0.8)["slope_x"]["mean"] == pytest.approx(0.8, rel=1e-5)
 
 
 def test_stand_drift_is_the_mean_velocity_not_the_sway():
@@ -287,18 +287,41 @@ def test_a_command_has_settled_after_a_second_unless_told_otherwise():
 
 
 def test_slopes_are_those_of_least_squares():
-    commanded, noise = torch.linspace(-1, 1, 500), torch.randn(500, generator=torch.Generator().manual_seed(0))
-    measured = 0.9 * commanded + 0.05 + 0.1 * noise
+    rng = torch.Generator().manual_seed(0)
+    commanded = 3.0 + torch.linspace(-1, 1, 500).reshape(50, 10)
+    measured = 0.9 * commanded + 0.05 + 0.1 * torch.randn(50, 10, generator=rng)
     import numpy as np
 
-    expected = np.polyfit(commanded.numpy(), measured.numpy(), 1)[0]
-    everything = torch.ones(500, dtype=torch.bool)
-    assert slope(commanded, measured, everything) == pytest.approx(expected, rel=1e-4)
-    assert math.isnan(slope(torch.ones(500), measured, everything))
+    mask = torch.rand(50, 10, generator=rng) < 0.7
+    mask[:, 3] = False
+    expected = np.polyfit(commanded[mask].numpy(), measured[mask].numpy(), 1)[0]
+    got = summarize_slope(commanded, measured, mask)
+    assert got["mean"] == pytest.approx(expected, rel=1e-4)
+    assert got["n"] == 9
+    nothing = {"mean": None, "ci95": None, "n": 0}
+    assert summarize_slope(torch.ones(50, 10), measured, mask) == nothing
+    assert summarize_slope(commanded, measured, torch.zeros(50, 10, dtype=torch.bool)) == nothing
     t = trajectory(envs=3)
     t.command[..., 0] = torch.tensor([-1.0, 0.0, 1.0])
     t.velocity[..., 0] = 0.8 * t.command[..., 0]
-    assert tracking_slopes(t, 0.8)["slope_x"] == pytest.approx(0.8, rel=1e-4)
+    assert tracking_slopes(t, 0.8)["slope_x"]["mean"] == pytest.approx(0.8, rel=1e-4)
+
+
+def test_the_interval_of_a_slope_is_as_wide_as_slopes_differ_between_samples_of_envs():
+    """What an env adds of its own, not the noise of its steps, decides; 95 % of intervals hold the slope."""
+    rng = torch.Generator().manual_seed(2)
+    slopes, held, widths = [], 0, []
+    for _ in range(200):
+        commanded = torch.empty(1, 60).uniform_(-1.0, 1.0, generator=rng).repeat(40, 1)
+        of_env = 0.2 * torch.randn(1, 60, generator=rng)
+        measured = 0.9 * commanded + of_env + 0.05 * torch.randn(40, 60, generator=rng)
+        got = summarize_slope(commanded, measured, torch.ones(40, 60, dtype=torch.bool), resamples=400)
+        low, high = got["ci95"]
+        slopes.append(got["mean"])
+        widths.append(high - low)
+        held += low <= 0.9 <= high
+    assert sum(widths) / 200 == pytest.approx(3.92 * float(torch.tensor(slopes).std()), rel=0.15)
+    assert 0.89 <= held / 200 <= 0.99
 
 
 def test_moving_average_against_a_plain_loop():

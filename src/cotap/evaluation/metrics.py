@@ -51,13 +51,30 @@ def settled_height(t: Trajectory) -> torch.Tensor:
     return (steps_since_change(asked) >= round(HEIGHT_SETTLE_S / t.dt)) & t.stand & t.alive()
 
 
-def slope(commanded: torch.Tensor, measured: torch.Tensor, mask: torch.Tensor) -> float:
-    """Least-squares slope, with intercept, of measured against commanded over all samples in `mask`."""
-    x, y = commanded[mask].double(), measured[mask].double()
-    if x.numel() < 2 or float(x.var()) < 1e-9:
-        return math.nan
-    x = x - x.mean()
-    return float((x * (y - y.mean())).sum() / x.square().sum())
+def summarize_slope(
+    commanded: torch.Tensor, measured: torch.Tensor, mask: torch.Tensor, seed: int = 0, resamples: int = 1000
+) -> dict[str, Any]:
+    """Least-squares slope, with intercept, of measured against commanded (T, N) where `mask` (T, N); a bootstrap over
+    envs gives its 95 % interval, and `n` counts them. Where nothing was commanded to differ the numbers are null."""
+    if int(mask.sum()) < 2 or float(commanded[mask].double().var()) < 1e-9:
+        return {"mean": None, "ci95": None, "n": 0}
+    counted = mask.any(0)
+    x, y, weight = (values[:, counted].double() for values in (commanded, measured, mask))
+    # Any origin will do for a slope; one amid the samples keeps the sums exact.
+    x, y = ((values - values[weight > 0.0].mean()) for values in (x, y))
+    of_env = torch.stack([(weight * values).sum(0) for values in (torch.ones_like(x), x, y, x * x, x * y)], 1)
+    n = len(of_env)
+    slopes = _slope_of(bootstrap_draws(n, seed, resamples).double() @ of_env)
+    low, high = torch.nanquantile(slopes, torch.tensor([0.025, 0.975], dtype=torch.float64)).tolist()
+    mean = float(_slope_of(of_env.sum(0)))
+    return {"mean": mean, "ci95": [min(low, mean), max(high, mean)], "n": n}
+
+
+def _slope_of(sums: torch.Tensor) -> torch.Tensor:
+    """Slope (...) by sums (..., 5) over samples of 1, x, y, x^2 and xy; NaN where all x agree."""
+    n, x, y, xx, xy = sums.unbind(-1)
+    spread = xx - x * x / n
+    return torch.where(spread > 1e-9 * n, (xy - x * y / n) / spread, math.nan)
 
 
 def swings(
@@ -128,15 +145,18 @@ def tracking_measures(t: Trajectory, gait_period_s: float, settle_s: float = 1.0
     }
 
 
-def tracking_slopes(t: Trajectory, gait_period_s: float, settle_s: float = 1.0) -> dict[str, float]:
+def tracking_slopes(
+    t: Trajectory, gait_period_s: float, settle_s: float = 1.0, seed: int = 0
+) -> dict[str, dict[str, Any]]:
     """Slopes of measured (gait-averaged) against commanded velocity while walking, and of height while standing, over
-    all envs."""
+    all envs, each with its interval."""
     measured = moving_average(t.velocity, round(gait_period_s / t.dt))
     ok = settled(t, settle_s + gait_period_s) & ~t.stand
     slopes = {
-        f"slope_{axis}": slope(t.command[..., i], measured[..., i], ok) for i, axis in enumerate(("x", "y", "yaw"))
+        f"slope_{axis}": summarize_slope(t.command[..., i], measured[..., i], ok, seed)
+        for i, axis in enumerate(("x", "y", "yaw"))
     }
-    return slopes | {"slope_height": slope(t.height_command, t.height, settled_height(t))}
+    return slopes | {"slope_height": summarize_slope(t.height_command, t.height, settled_height(t), seed)}
 
 
 def summarize(

@@ -98,7 +98,10 @@ def table(result: dict[str, Any]) -> str:
         low, high = m["ci95"]
         lines.append(f"| {name} | {m['mean']:.4f} | {m['std']:.4f} | {low:.4f} to {high:.4f} | {unit(name)} |")
     for name, value in result.get("slopes", {}).items():
-        lines.append(f"| {name} | {'-' if value is None else f'{value:.3f}'} | | | |")
+        interval = (
+            "{:.4f} to {:.4f}".format(*result["slopes_ci95"][name]) if value is not None else "no env walked or stood"
+        )
+        lines.append(f"| {name} | {'-' if value is None else f'{value:.4f}'} | | {interval} | |")
     falls = f"{result['num_falls']} of {result['num_envs']} envs fell"
     return "\n".join([*lines, "", f"{heading(result)}: {falls}, {result['seconds']:.1f} s"])
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -90,12 +89,13 @@ class VelocityTracking(RolloutProtocol):
         measures = tracking_measures(trajectory, period, self.settle_seconds)
         stood = ~trajectory.fell.any(0)
         metrics = summaries(measures, torch.ones_like(stood), self.seed)
-        slopes = tracking_slopes(trajectory, period, self.settle_seconds)
+        slopes = tracking_slopes(trajectory, period, self.settle_seconds, self.seed)
         return {
             "e_lin": metrics["e_lin"]["mean"],
             "e_yaw": metrics["e_yaw"]["mean"],
             "episode_length_fraction": metrics["episode_length_fraction"]["mean"],
-            "slopes": {name: None if math.isnan(value) else value for name, value in slopes.items()},
+            "slopes": {name: slope["mean"] for name, slope in slopes.items()},
+            "slopes_ci95": {name: slope["ci95"] for name, slope in slopes.items()},
             "metrics": metrics,
             "metrics_without_falls": summaries(measures, stood, self.seed),
             "window": {"start": 0.0, "end": self.episode_seconds},
