@@ -3,9 +3,9 @@
 import sys
 from pathlib import Path
 
+from cotap.__main__ import main
 from cotap.robots import ROBOTS, ArmSpec, FootSpec, RobotSpec
 from cotap.robots.from_facts import Gains, robot_from_facts
-from cotap.train import main
 
 SIDES = {"left": "l", "right": "r"}  # left first
 ARM = ("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow")
@@ -38,4 +38,4 @@ def my_robot() -> RobotSpec:
 ROBOTS["my-robot"] = my_robot
 
 if __name__ == "__main__":
-    sys.exit(main(["base", "--env.robot", "my-robot", *sys.argv[1:]]))
+    sys.exit(main())  # the command cotap, which now knows the robot

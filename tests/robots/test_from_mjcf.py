@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import runpy
 import shlex
@@ -96,14 +97,18 @@ def test_it_stands_steps_and_is_mirrored(own):
     assert data.site("left_foot").xpos[2] == pytest.approx(0.0, abs=1e-6)
 
 
-def test_it_trains_as_the_page_says(own, monkeypatch):  # noqa: ARG001
+def test_it_trains_as_the_page_says_and_is_evaluated(own, monkeypatch):  # noqa: ARG001
     (arguments,) = commands("own_robot")
     few = ["--env.num-envs", "4", "--runner.iterations", "1", "--threads", "1", "--ppo.steps", "4"]
-    monkeypatch.setattr("sys.argv", ["own_robot.py", *arguments, *few])
-    with pytest.raises(SystemExit) as end:
-        runpy.run_path(str(EXAMPLE), run_name="__main__")
-    assert end.value.code == 0
-    assert load_checkpoint(Path("runs/my-robot/checkpoint_000001.pt"))["layout"]["robot"] == NAME
+    trained = "runs/my-robot/checkpoint_000001.pt"
+    look = ["evaluate", "velocity-tracking", "--checkpoint", trained, "--num-envs", "2", "--episode-seconds", "5"]
+    for line in ([*arguments, *few], [*look, "--threads", "1", "--json", "seen.json"]):
+        monkeypatch.setattr("sys.argv", ["own_robot.py", *line])
+        with pytest.raises(SystemExit) as end:
+            runpy.run_path(str(EXAMPLE), run_name="__main__")
+        assert end.value.code == 0
+    assert load_checkpoint(Path(trained))["layout"]["robot"] == NAME
+    assert json.loads(Path("seen.json").read_text())["settings"]["env"]["robot"] == NAME
 
 
 def test_what_cotap_makes_of_a_robot_gives_its_facts_back(any_spec, tmp_path):
