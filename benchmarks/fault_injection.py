@@ -32,7 +32,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from cotap import train
 from cotap.agents.checkpoint import load_checkpoint
 from cotap.agents.dual_ppo import DualPPO
-from cotap.agents.runner import CHECKPOINT_PATTERN
+from cotap.agents.runner import CHECKPOINT_PATTERN, newest_checkpoint
 from cotap.envs import HumanoidEnv
 from cotap.envs.external_forces import ExternalForces
 
@@ -124,7 +124,7 @@ def _train(args: list[str], log: Path, beats: int, prepare: Prepare | None) -> N
 
 def newest(folder: Path) -> Path | None:
     """The newest checkpoint of a run, if it has one."""
-    return max(folder.glob(CHECKPOINT_PATTERN), default=None)
+    return newest_checkpoint(folder)
 
 
 def newest_iteration(folder: Path) -> int:

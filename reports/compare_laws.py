@@ -36,7 +36,6 @@ from cotap.evaluation.stability import Stability, energy_summary, exchanged_ener
 from cotap.evaluation.static import StaticStiffness, settle
 from cotap.evaluation.wrong_model import misjudge
 from cotap.files import write_atomically
-from cotap.robots import h1
 from reports.law_figures import draw_properties, draw_static, draw_transient
 from reports.paper.tables import PROPERTIES, STATIC
 
@@ -318,12 +317,13 @@ class Properties:
             arms = laws_of(name, self.stiffness, self.null_stiffness).configure()
             cfg = self.stability.configure(HumanoidEnvConfig(backend="mujoco", num_threads=self.threads))
             cfg.upper_body = arms
+            env = HumanoidEnv(cfg)
             rows[name] = {
                 "softer_over_stiffer": soft / stiff,
                 "wrong_over_right_displacement": wrong / right,
                 "wrong_model_shift": float((misled - at).norm()),
-                "linearised": growth_rates(h1(), arms.built(arms.left), self.stability),
-                "energy": energy_summary(exchanged_energy(HumanoidEnv(cfg), self.stability)[0]),
+                "linearised": growth_rates(env.spec, arms.built(arms.left), self.stability, env.dt),
+                "energy": energy_summary(exchanged_energy(env, self.stability)[0]),
             }
             print(f"  {name}", file=sys.stderr)
         return {"rows": rows}

@@ -19,7 +19,7 @@ from typing import Any
 import tyro
 
 from cotap.agents.checkpoint import load_checkpoint, require_parts, write_json
-from cotap.agents.runner import CHECKPOINT_PATTERN
+from cotap.agents.runner import CHECKPOINT_PATTERN, checkpoints_of
 from cotap.checks import require_one_of, require_positive_int, require_range, require_seed, shortened
 from cotap.evaluate import evaluate
 from cotap.evaluation.report import pyplot, save_figure
@@ -108,7 +108,7 @@ def checkpoints(run: str) -> list[Row]:
         ValueError: there is none, or one cannot be read.
     """
     rows = []
-    for path in sorted(Path(run).glob(CHECKPOINT_PATTERN)):
+    for path in checkpoints_of(Path(run)):
         content = load_checkpoint(path)
         require_parts(path, content, ("samples", "wall_seconds"))
         rows.append({"run": run, "checkpoint": path.name} | {k: content[k] for k in ("samples", "wall_seconds")})

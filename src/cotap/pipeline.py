@@ -10,7 +10,6 @@ from pathlib import Path
 from cotap.agents.checkpoint import STAGES
 from cotap.checks import require_one_of, require_range
 from cotap.configs import BASE_RECIPES, DISTILL_RECIPES, BaseTraining, DistillTraining
-from cotap.sim import resolve_backend
 
 RunStage = Callable[[str, list[str]], Path]
 """Trains one stage, given its name and its arguments as if typed, and returns its directory."""
@@ -52,12 +51,12 @@ class PipelineOptions:
         require_range("num_envs", self.num_envs, 0, 1e9)
         for name in ("base_iterations", "distill_iterations"):
             require_range(name, getattr(self, name), 0, 1e9)
-        require_range("threads", self.threads, 0, 4096)
-        resolve_backend(self.backend)
         if self.recipe:
             require_one_of("recipe", self.recipe, BASE_RECIPES.keys() & DISTILL_RECIPES.keys())
             if self.quick:
                 raise ValueError(f"--quick is a recipe, so --recipe {self.recipe!r} is not allowed")
+        for training in self._trainings():
+            training.check()
         if self.resume and not self.run_dir:
             raise ValueError("--resume goes on with the runs in --run-dir, which is not given")
 
@@ -75,10 +74,12 @@ class PipelineOptions:
         """Both configurations."""
         base = BASE_RECIPES[self.chosen]()
         samples = base.samples
+        base.seed, base.threads, base.device = self.seed, self.threads, self.device
         base.env.robot, base.env.backend, base.env.num_threads = self.robot, self.backend, self.threads
         base.env.num_envs = self.num_envs or base.env.num_envs
         base.train_for(samples)
         distill = DISTILL_RECIPES[self.chosen](base)
+        distill.threads, distill.device = self.threads, self.device
         base.runner.iterations = self.base_iterations or base.runner.iterations
         distill.runner.iterations = self.distill_iterations or distill.runner.iterations
         return base, distill
@@ -140,15 +141,16 @@ def _part(options: PipelineOptions, run_dir: Path, iterations: int, begin: list[
     Returns its newest checkpoint. Raises Stopped if that is not its last.
     """
     from cotap.agents.checkpoint import load_checkpoint
+    from cotap.agents.runner import newest_checkpoint
 
-    newest = _newest(run_dir) if options.resume else None
+    newest = newest_checkpoint(run_dir) if options.resume else None
     envs = ["--num-envs", str(options.num_envs)] if options.num_envs else []
     run_stage(run_dir.name, [
         *envs, "--seed", str(options.seed), "--threads", str(options.threads),
         "--backend", options.backend, "--device", options.device, "--iterations", str(iterations),
         "--run-dir", str(run_dir), *(["--resume", str(newest)] if newest else begin),
     ])  # fmt: skip
-    newest = _newest(run_dir)
+    newest = newest_checkpoint(run_dir)
     assert newest, f"{run_dir} holds no checkpoint of a stage that ended"
     reached = load_checkpoint(newest)["iteration"]
     if reached < iterations:
@@ -159,19 +161,14 @@ def _part(options: PipelineOptions, run_dir: Path, iterations: int, begin: list[
     return newest
 
 
-def _newest(run_dir: Path) -> Path | None:
-    from cotap.agents.runner import CHECKPOINT_PATTERN
-
-    return max(run_dir.glob(CHECKPOINT_PATTERN), default=None)
-
-
 def _summary(run_dir: Path) -> str:
     """What each stage took, as a Markdown table, and what to type next."""
     from cotap.agents.checkpoint import load_checkpoint
+    from cotap.agents.runner import newest_checkpoint
 
     lines = ["| run | iterations | samples | seconds | checkpoint |", "|---|---|---|---|---|"]
     for part in STAGES:
-        path = _newest(run_dir / part)
+        path = newest_checkpoint(run_dir / part)
         assert path, f"{run_dir / part} holds no checkpoint"
         content = load_checkpoint(path)
         lines.append(
@@ -182,7 +179,9 @@ def _summary(run_dir: Path) -> str:
 
 def next_commands(run_dir: Path) -> str:
     """What a user may want to type after a training; nothing where it saved no checkpoint."""
-    newest = _newest(run_dir)
+    from cotap.agents.runner import newest_checkpoint
+
+    newest = newest_checkpoint(run_dir)
     if newest is None:
         return ""
     commands = (

@@ -126,7 +126,7 @@ def run_stage(stage: str, args: list[str]) -> Path:
 def _expand(args: list[str]) -> list[str]:
     """Arguments with names as the options have them, shortcuts written out, and the files that checkpoints' names and
     auto mean."""
-    from cotap.agents.runner import CHECKPOINT_PATTERN
+    from cotap.agents.runner import newest_checkpoint
     from cotap.evaluation.policy import CHECKPOINTS, find_checkpoint
 
     args = [_named(key) + sep + value for key, sep, value in (a.partition("=") for a in args)]
@@ -138,8 +138,7 @@ def _expand(args: list[str]) -> list[str]:
     run_dir = _peek(args, "--run-dir")
     if not run_dir:
         raise ValueError("--resume auto looks for checkpoints in --run-dir, which is not given")
-    newest = max(Path(run_dir).glob(CHECKPOINT_PATTERN), default="")
-    return [*args, f"--resume={newest}"]
+    return [*args, f"--resume={newest_checkpoint(Path(run_dir)) or ''}"]
 
 
 def _resumes_newest(args: list[str]) -> bool:

@@ -18,7 +18,7 @@ from dummy_env import DummyEnv, make_runner
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from cotap.agents.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
-from cotap.agents.runner import DualRunner, TrainingFault, check_run_dir, sole_writer
+from cotap.agents.runner import DualRunner, TrainingFault, check_run_dir, checkpoints_of, newest_checkpoint, sole_writer
 from cotap.agents.runner_config import RunnerConfig
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.observations import NoiseConfig, ObservationConfig
@@ -138,6 +138,18 @@ def test_only_the_newest_checkpoint_keeps_simulator_states(tmp_path: Path):
         assert not torch.equal(
             content["model"]["actors.lower.mlp.0.weight"], newest["model"]["actors.lower.mlp.0.weight"]
         )
+
+
+def test_the_newest_checkpoint_is_that_of_the_highest_iteration(tmp_path: Path):
+    assert newest_checkpoint(tmp_path) is None
+    for iteration in (1_000_000, 25, 999_999):
+        (tmp_path / f"checkpoint_{iteration:06d}.pt").touch()
+    found = [path.name for path in checkpoints_of(tmp_path)]
+    assert found == ["checkpoint_000025.pt", "checkpoint_999999.pt", "checkpoint_1000000.pt"]
+    assert newest_checkpoint(tmp_path) == tmp_path / found[-1]
+    check_run_dir(tmp_path, tmp_path / found[-1])
+    with pytest.raises(ValueError, match="newer checkpoint than that"):
+        check_run_dir(tmp_path, tmp_path / found[-2])
 
 
 def test_an_older_checkpoint_goes_on_with_fresh_envs(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -20,6 +20,8 @@ from cotap.evaluation.linearization import linearize
 from cotap.evaluation.stability import Stability, energy_summary, exchanged_energy, growth_rates, random_poses
 from cotap.robots.chains import arm_model
 
+DT = 0.02
+
 
 class Pushing:
     """PD whose damping has the wrong sign: gives energy away."""
@@ -37,7 +39,7 @@ def parameters(n, stiffness=500.0, alpha=1.0) -> LawParameters:
 
 def loop(spec, name, q, stiffness=500.0, **fields):
     cfg = LawConfig(name, **fields)
-    return linearize(lambda a: LAWS[name](a, cfg), arm_model(spec), q, q, parameters(len(q), stiffness))
+    return linearize(lambda a: LAWS[name](a, cfg), arm_model(spec), q, q, parameters(len(q), stiffness), DT)
 
 
 @pytest.mark.parametrize("kp", [100.0, 30.0])
@@ -68,7 +70,7 @@ def test_pd_has_the_eigenvalues_of_mujocos_arm(spec, model, rng, kp):
 def test_what_is_known_of_laws(spec, rng):
     """The wrong damping grows; a FACET does against a stiff wall and not when free; CoTaP holds against any wall."""
     q = 0.5 * random_poses(spec, 20, rng)
-    pushing = linearize(Pushing, arm_model(spec), q, q, parameters(20))
+    pushing = linearize(Pushing, arm_model(spec), q, q, parameters(20), DT)
     assert float(pushing.growth().min()) > 0.0
     facet, cotap = loop(spec, "facet", q), loop(spec, "cotap", q)
     assert float(facet.growth().max()) < 0.0
@@ -90,8 +92,10 @@ def test_a_free_facet_decays_with_the_slower_of_arm_and_virtual_mass(spec, rng):
 
 def test_rates_are_counted_per_wall_and_load(spec):
     protocol = Stability(poses=10, walls=(0.0, 1e4), load_rad=0.1)
-    rows = growth_rates(spec, LawConfig("facet", stiffness=(500.0, 500.0, 500.0)), protocol)
+    rows = growth_rates(spec, LawConfig("facet", stiffness=(500.0, 500.0, 500.0)), protocol, DT)
     assert [(r["load_rad"], r["wall"]) for r in rows] == [(0.0, 0.0), (0.0, 1e4), (0.1, 0.0), (0.1, 1e4)]
+    law = LawConfig("facet", stiffness=(500.0, 500.0, 500.0))
+    assert growth_rates(spec, law, protocol, DT / 10.0) != rows  # acting more often makes another loop
     assert rows[0]["share_unstable"] == 0.0
     assert rows[1]["share_unstable"] == 1.0
 
@@ -144,8 +148,8 @@ def test_without_the_ratio_both_halves_are_without_it(spec, checkpoint, tmp_path
     content = json.loads((tmp_path / "out.json").read_text())
     left = LawConfig("cotap", condition_threshold=2.0)
     never = replace(left, condition_threshold=math.inf)
-    assert content["linearised"] == growth_rates(spec, never, Stability(poses=8))
-    assert content["linearised"] != growth_rates(spec, left, Stability(poses=8))
+    assert content["linearised"] == growth_rates(spec, never, Stability(poses=8), DT)
+    assert content["linearised"] != growth_rates(spec, left, Stability(poses=8), DT)
     assert not content["settings"]["env"]["upper_body"]["singularity_ratio"]
 
 

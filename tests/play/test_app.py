@@ -46,6 +46,21 @@ def test_mail_reaches_the_simulation_and_bad_mail_does_not(app):
     assert stiffness.tolist() == [700.0, 1500.0]
 
 
+@pytest.mark.parametrize("ending", [KeyboardInterrupt, RuntimeError])
+def test_what_was_recorded_is_kept_whatever_ends_the_page(app, monkeypatch, capsys, ending):
+    app.mailbox.ask(Record(True))
+    app.advance()
+
+    def end():
+        raise ending
+
+    monkeypatch.setattr(app, "_draw_until_stopped", end)
+    with pytest.raises(ending):
+        app.run()
+    assert len(load_recording(app.archive.path).trajectory.fell) >= 1
+    assert str(app.archive.path) in capsys.readouterr().out
+
+
 def test_the_page_shows_what_was_accepted_not_what_was_sent(app):
     alpha = app.panel._handles["a.left.alpha"]
     for sent, shown in ((0.25, 0.25), (float("nan"), 0.25), (7.0, 1.0)):

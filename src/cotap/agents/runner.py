@@ -37,6 +37,23 @@ from cotap.agents.runner_config import RunnerConfig
 from cotap.checks import reason_of
 
 CHECKPOINT_PATTERN = "checkpoint_*.pt"
+
+
+def checkpoints_of(run_dir: Path) -> list[Path]:
+    """A run's checkpoints, oldest first; from a million iterations on, their names are longer."""
+    return sorted(run_dir.glob(CHECKPOINT_PATTERN), key=_age)
+
+
+def newest_checkpoint(run_dir: Path) -> Path | None:
+    """A run's newest checkpoint; None if it has none."""
+    return max(run_dir.glob(CHECKPOINT_PATTERN), key=_age, default=None)
+
+
+def _age(path: Path) -> tuple[int, str]:
+    """Orders the checkpoints of one run by iteration."""
+    return len(path.name), path.name
+
+
 MODEL = ("collision", "unevenness_m", "fixed_base")
 """Fields of an environment's config that make a model of other shapes or joints."""
 
@@ -58,9 +75,9 @@ def check_run_dir(run_dir: Path, resumed: Path | None = None) -> None:
     """
     if run_dir.exists() and not run_dir.is_dir():
         raise ValueError(f"run directory {str(run_dir)!r} is a file")
-    newest = max(run_dir.glob(CHECKPOINT_PATTERN), default=None)
+    newest = newest_checkpoint(run_dir)
     own = resumed is not None and resumed.resolve().parent == run_dir.resolve()
-    if newest and not (own and resumed and newest.name <= resumed.name):
+    if newest and not (own and resumed and _age(newest) <= _age(resumed)):
         what = "has a newer checkpoint than that" if own else "already holds a run"
         raise ValueError(
             f"run directory {str(run_dir)!r} {what}; go on with --resume {newest}, or choose another --run-dir"
@@ -244,7 +261,7 @@ class DualRunner:
                     save_checkpoint(target, self._kept)
             except OSError as failed:
                 say(f"what was learned last could not be saved: {failed}")
-        newest = max(self.run_dir.glob(CHECKPOINT_PATTERN), default=None)
+        newest = newest_checkpoint(self.run_dir)
         way_on = f"go on with --resume {newest}" if newest else "there is no checkpoint yet to go on from"
         what = f"{type(error).__name__}: {error}"
         return f"iteration {iteration} failed ({what}); {way_on}"
@@ -270,9 +287,9 @@ class DualRunner:
         others = self.ranks.gather(self._own_state)
         if self.ranks.leads:
             save_checkpoint(target, self._content() | {"others": others})
-            older = [path for path in self.run_dir.glob(CHECKPOINT_PATTERN) if path < target]
+            older = [path for path in checkpoints_of(self.run_dir) if _age(path) < _age(target)]
             if older:
-                _shed_simulator_states(max(older))
+                _shed_simulator_states(older[-1])
         self._saved = self.current_learning_iteration
 
     def load(self, path: str) -> None:

@@ -58,7 +58,7 @@ class ClosedLoop:
 
 def linearize(
     make: Callable[[Arms], UpperBodyLaw], arms: Arms, q: torch.Tensor, target: torch.Tensor,
-    parameters: LawParameters, dt: float = 0.02,
+    parameters: LawParameters, dt: float,
 ) -> ClosedLoop:  # fmt: skip
     """The loop about arms at rest at `q` that are sent to `target`, both (N, A, n); P = N A poses.
 

@@ -80,7 +80,7 @@ class Stability(Protocol):
     def evaluate(self, env: HumanoidEnv, policy: PolicyFunction) -> dict[str, Any]:  # noqa: ARG002
         """Analyse and measure the left arm's law. Returns the measured part of the JSON."""
         arms = env.cfg.upper_body
-        rates = growth_rates(env.spec, arms.built(arms.left), self)
+        rates = growth_rates(env.spec, arms.built(arms.left), self, env.dt)
         exchanged, self.film = exchanged_energy(env, self)
         energy = energy_summary(exchanged)
         return {"num_poses": self.poses, "linearised": rates, "energy": energy}
@@ -101,8 +101,9 @@ def random_poses(spec: RobotSpec, count: int, rng: torch.Generator) -> torch.Ten
     return center + half * uniform(rng, -1.0, 1.0, count, *center.shape)
 
 
-def growth_rates(spec: RobotSpec, law: LawConfig, protocol: Stability) -> list[dict[str, float]]:
-    """Largest real part of the linearised loop per wall, at rest and loaded: the largest, and how many are positive."""
+def growth_rates(spec: RobotSpec, law: LawConfig, protocol: Stability, dt: float) -> list[dict[str, float]]:
+    """Largest real part of the linearised loop, whose law acts every `dt` [s], per wall, at rest and loaded: the
+    largest, and how many are positive."""
     rng = torch.Generator().manual_seed(protocol.seed)
     arms = arm_model(spec)
     q = random_poses(spec, -(-protocol.poses // len(spec.arms)), rng)
@@ -117,7 +118,7 @@ def growth_rates(spec: RobotSpec, law: LawConfig, protocol: Stability) -> list[d
                 torch.tensor(law.stiffness).expand(*shape, 3), torch.full(shape, law.null_stiffness),
                 torch.full(shape, law.alpha),
             )  # fmt: skip
-            loop = linearize(lambda a: LAWS[law.name](a, law), arms, q[part], target[part], parameters)
+            loop = linearize(lambda a: LAWS[law.name](a, law), arms, q[part], target[part], parameters, dt)
             for found, wall in zip(rates, protocol.walls, strict=True):
                 found.append(loop.growth(wall))
         for found, wall in zip(rates, protocol.walls, strict=True):

@@ -86,10 +86,9 @@ class App:
         finally:
             self.stop()
             thread.join(5.0)
+            self._keep_recording()
         if self._failure is not None:
             raise self._failure
-        if self._chosen:
-            self._keep_recording()
         return self._chosen
 
     def stop(self) -> None:
@@ -320,4 +319,6 @@ class App:
         except (OSError, ValueError) as error:
             self.notices.tell(str(error), title="not recorded")
         else:
-            self.notices.tell(f"{recorder.seconds:.1f} s written to {path}", title="recorded")
+            text = f"{recorder.seconds:.1f} s written to {path}"
+            print(text, flush=True)  # the page may be closed, or about to be
+            self.notices.tell(text, title="recorded")
