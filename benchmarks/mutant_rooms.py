@@ -12,9 +12,7 @@ PASSIVITY, DYNAMICS, KINEMATICS, INVERSE, TORSO = (
 LOOP, STOP, ENGINES, EXPORT, ONNX_FILE = (
     f"tests/deployment/test_{n}.py" for n in ("loop", "stop", "engines", "export", "onnx_file")
 )
-PARITY, SIM_TO_SIM, TOUR, TRIAL_ROWS = (
-    f"tests/deployment/test_{n}.py" for n in ("parity", "sim_to_sim", "tour_in_engine", "trial_rows")
-)
+TOUR, TRIAL_ROWS = (f"tests/deployment/test_{n}.py" for n in ("tour_in_engine", "trial_rows"))
 
 ROOMS: dict[str, dict[str, tuple[str, ...]]] = {
     "compliance": {
@@ -56,12 +54,10 @@ ROOMS: dict[str, dict[str, tuple[str, ...]]] = {
         "src/cotap/deployment/rotors.py": (ENGINES,),
         "src/cotap/deployment/safety.py": (LOOP, STOP),
         "src/cotap/deployment/scenario.py": (LOOP, STOP),
-        "src/cotap/deployment/sim_to_sim.py": (SIM_TO_SIM,),
         "src/cotap/deployment/terms.py": (EXPORT,),
         "src/cotap/deployment/tour.py": (TOUR,),
         "src/cotap/deployment/trial.py": (STOP, LOOP, TRIAL_ROWS),
         "src/cotap/deployment/trials.py": (LOOP,),
-        "src/cotap/deployment/workers.py": (SIM_TO_SIM,),
     },
 }
 """Tests by file, by room; the first ones listed run first, and the first that fails ends a mutant's run."""

@@ -14,8 +14,8 @@ from cotap.agents.checkpoint import write_json
 from cotap.deployment.controller import robot_of
 from cotap.deployment.engines import make_engine
 from cotap.deployment.policy import OnnxPolicy
-from cotap.deployment.sim_to_sim import Comparison, compare, figure, markdown
 from cotap.files import write_atomically
+from reports.paper.engines import Comparison, compare, figure, markdown
 
 
 @dataclass

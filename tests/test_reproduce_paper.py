@@ -395,7 +395,7 @@ def test_sim_to_sim_is_a_part_that_goes_on_where_it_stopped(trained, monkeypatch
         assert (kept / "mujoco-impact.json").exists() == reuse
         return {}
 
-    module = "cotap.deployment.sim_to_sim"
+    module = "reports.paper.engines"
     monkeypatch.setattr(f"{module}.compare", compare)
     monkeypatch.setattr(f"{module}.markdown", lambda _: "## Impact, arms moving\n\n| a |\n|---|\n")
     monkeypatch.setattr(f"{module}.figure", lambda _, path: path.write_bytes(b"picture"))

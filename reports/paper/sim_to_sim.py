@@ -1,4 +1,4 @@
-"""The policy outside of its trainer: the paper's section IV-C, by `cotap.deployment.sim_to_sim`."""
+"""The policy outside of its trainer: the paper's section IV-C, by `reports.paper.engines`."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ def sim_to_sim(book: Book) -> None:
     import os
 
     from cotap.deployment.graph import export_policy
-    from cotap.deployment.sim_to_sim import Comparison, compare, figure, markdown
     from cotap.evaluation.policy import find_checkpoint
+    from reports.paper.engines import Comparison, compare, figure, markdown
 
     trials = min(QUICK_TRIALS if book.quick else TRIALS, book.envs)
     there, absent = installed(book.robot)

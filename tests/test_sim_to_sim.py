@@ -5,21 +5,35 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
 import torch
+from random_policy import save_random_policy
 
 from cotap.compliance.laws import READS, LawConfig
-from cotap.deployment import sim_to_sim
 from cotap.deployment.controller import law_config
 from cotap.deployment.engines import EngineConfig
+from cotap.deployment.graph import export_policy
+from cotap.deployment.policy import OnnxPolicy
 from cotap.deployment.robot import Perturbations
 from cotap.deployment.safety import SafetyConfig
 from cotap.deployment.scenario import Scenario
-from cotap.deployment.sim_to_sim import (
+from cotap.deployment.trial import Trial
+from cotap.envs.upper_body import UpperBodyConfig
+from cotap.evaluate import parse
+from cotap.evaluation.disturbance import ConstantLoad, Impact
+from cotap.evaluation.law_options import parse_law
+from cotap.evaluation.policy import shipped_checkpoint
+from cotap.robots import ROBOTS, RobotSpec
+from reports import sim_to_sim as script
+from reports.paper import engines
+from reports.paper.arms import arms as impact_arms
+from reports.paper.constant_load import ROWS as LOADS
+from reports.paper.engines import (
     Comparison,
     compare,
     falls,
@@ -31,18 +45,22 @@ from cotap.deployment.sim_to_sim import (
     periodic,
     statics,
 )
-from cotap.deployment.trial import Trial
-from cotap.deployment.workers import Workers
-from cotap.envs.upper_body import UpperBodyConfig
-from cotap.evaluate import parse
-from cotap.evaluation.disturbance import ConstantLoad, Impact
-from cotap.evaluation.law_options import parse_law
-from cotap.robots import ROBOTS, RobotSpec
-from reports import sim_to_sim as script
-from reports.paper.arms import arms as impact_arms
-from reports.paper.constant_load import ROWS as LOADS
+from reports.paper.workers import Workers
 
 PD = {"PD": "pd"}
+
+
+@pytest.fixture(scope="module")
+def policy_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of a policy that has learned nothing."""
+    path = tmp_path_factory.mktemp("policy") / "policy.onnx"
+    export_policy(save_random_policy(path.with_suffix(".pt")), path, checks=20)
+    return path
+
+
+@pytest.fixture(scope="module")
+def policy(policy_file: Path) -> OnnxPolicy:
+    return OnnxPolicy(policy_file)
 
 
 def test_rates_of_falls_have_wilsons_interval():
@@ -85,7 +103,7 @@ def test_trials_that_fell_are_in_no_figure_of_the_hand(spec: RobotSpec, part: Ca
 
 
 def test_perturbations_are_what_their_labels_say():
-    assert {label: tuple(vars(p).values()) for label, p in sim_to_sim.PERTURBATIONS.items()} == {
+    assert {label: tuple(vars(p).values()) for label, p in engines.PERTURBATIONS.items()} == {
         "none": ((0, 0), 0.0, 0.0, 0.0, 0.0, 0.0),
         "delay of 1 step": ((1, 1), 0.0, 0.0, 0.0, 0.0, 0.0),
         "delay of 2 steps": ((2, 2), 0.0, 0.0, 0.0, 0.0, 0.0),
@@ -146,10 +164,12 @@ def test_statics_is_jacobian_transpose_and_compliance(any_spec, any_model):
 
 
 @pytest.mark.slow
-def test_a_small_comparison_is_written_whole(shipped_file, tmp_path, monkeypatch):
-    monkeypatch.setattr(sim_to_sim, "laws_by_part", lambda _: {"impact": PD, "constant-load": PD})
-    monkeypatch.setattr(sim_to_sim, "PERTURBATIONS", {"late": Perturbations(delay_steps=(1, 1))})
-    arguments = ["--policy", str(shipped_file), "--engines", "mujoco", "--trials", "1", "--perturbed-trials", "1",
+def test_a_small_comparison_is_written_whole(tmp_path, monkeypatch):
+    policy = tmp_path / "h1-base.onnx"
+    export_policy(shipped_checkpoint("h1-base"), policy, checks=20)
+    monkeypatch.setattr(engines, "laws_by_part", lambda _: {"impact": PD, "constant-load": PD})
+    monkeypatch.setattr(engines, "PERTURBATIONS", {"late": Perturbations(delay_steps=(1, 1))})
+    arguments = ["--policy", str(policy), "--engines", "mujoco", "--trials", "1", "--perturbed-trials", "1",
                  "--load-trials", "3", "--episode-seconds", "2", "--timestep", "0.01", "--jobs", "1", "--output",
                  str(tmp_path)]  # fmt: skip
     assert script.main(arguments) == 0
@@ -161,7 +181,7 @@ def test_a_small_comparison_is_written_whole(shipped_file, tmp_path, monkeypatch
     assert "| late | 0 of 1" in (tmp_path / "report.md").read_text()
     assert (tmp_path / "report.png").read_bytes().startswith(b"\x89PNG")
     # Again, from what was kept; with another seed, anew.
-    monkeypatch.setattr(sim_to_sim, "loads", None)
+    monkeypatch.setattr(engines, "loads", None)
     assert script.main(arguments) == 0
     assert json.loads((tmp_path / "report.json").read_text())["engines"] == result["engines"]
     with pytest.raises(TypeError):
@@ -191,8 +211,8 @@ def test_parts_are_run_as_they_ask_and_otherwise_as_the_policy_was_trained(polic
         del policy, cfg
         return {"a": lambda: {"ran": run(Scenario(1.0), 3)}, "b": lambda: {"ran": run(Scenario(2.0), 4, laws, wrong)}}
 
-    monkeypatch.setattr(sim_to_sim, "Workers", Recorder)
-    monkeypatch.setattr(sim_to_sim, "_parts", parts)
+    monkeypatch.setattr(engines, "Workers", Recorder)
+    monkeypatch.setattr(engines, "_parts", parts)
     result = compare(policy_file, Comparison(engines=("mujoco",), seed=7, timestep=0.002))
     engine, safety = EngineConfig("mujoco", 0.002), SafetyConfig()
     assert asked == [
@@ -229,7 +249,7 @@ def a_result() -> dict[str, Any]:
     arms = {
         "left": {"elbow_torque_nm": 6.0, "elbow_torque_statics_nm": 5.0, "hand_swing_m": 0.05,
                  "hand_swing_statics_m": None, "torque": [1.0, 3.0]},
-        "right": dict.fromkeys(sim_to_sim.SWINGS),
+        "right": dict.fromkeys(engines.SWINGS),
     }  # fmt: skip
     one = {
         "velocity-tracking": fell | {"metrics": {"e_lin": some}}, "impact": {"K 100": law | {"curve": [0.1, 0.2, 0.4]}},
@@ -290,7 +310,7 @@ def test_arms_move_but_under_loads_that_last(policy):
         cfg = Comparison(motion=motion, trials=3, perturbed_trials=4, load_trials=5)
         for part, count in counts.items():
             with pytest.raises(Asked) as asked:
-                sim_to_sim._parts(policy, cfg, run)[part]()
+                engines._parts(policy, cfg, run)[part]()
             assert asked.value.args == ("" if part.endswith("-load") else clip, count), part
 
 

@@ -27,7 +27,6 @@ from cotap.deployment.robot import Perturbations
 from cotap.deployment.safety import SafetyConfig
 from cotap.deployment.scenario import ArmMotion, Scenario, TimedCommand
 from cotap.deployment.trial import Trial, trajectory
-from cotap.deployment.workers import Workers
 from cotap.envs import HumanoidEnvConfig
 from cotap.envs.scripted_forces import ForceProfile
 from cotap.envs.state import StateReader
@@ -41,6 +40,7 @@ from cotap.evaluation.report import pyplot
 from cotap.motions.elbow import elbow_index
 from cotap.motions.reference import HELD, MIXTURE
 from cotap.robots import RobotSpec
+from reports.paper.workers import Workers
 
 STAND = (TimedCommand(stand=True),)
 ONSET_S = 3.0
