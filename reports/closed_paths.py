@@ -20,12 +20,12 @@ from cotap.agents.checkpoint import write_json
 from cotap.checks import require_positive_int, require_range, require_seed
 from cotap.compliance.laws import LawConfig
 from cotap.configs import to_plain
-from cotap.evaluation.closed_paths import circles, lead, spring_of
 from cotap.evaluation.metrics import summarize
 from cotap.evaluation.stability import random_poses
 from cotap.files import write_atomically
 from cotap.robots import ROBOTS
 from cotap.robots.chains import arm_model
+from reports.led_hands import circles, lead, spring_of
 
 
 def _cotap(stiffness: float, **fields: Any) -> LawConfig:

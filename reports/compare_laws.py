@@ -34,10 +34,10 @@ from cotap.evaluation.report import save_figure
 from cotap.evaluation.rollout import idle
 from cotap.evaluation.stability import Stability, energy_summary, exchanged_energy, growth_rates
 from cotap.evaluation.static import StaticStiffness, settle
-from cotap.evaluation.wrong_model import misjudge
 from cotap.files import write_atomically
 from reports.law_figures import draw_properties, draw_static, draw_transient
 from reports.paper.tables import PROPERTIES, STATIC
+from reports.wrong_model import misjudge
 
 LOADS_N = (10.0, 30.0, 50.0)
 COTAP: dict[str, Any] = {"method": "cotap", "alpha": 1.0, "error": "joint", "damping": "critical"}

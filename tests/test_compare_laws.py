@@ -12,9 +12,9 @@ from random_policy import save_random_policy
 from cotap.compliance.laws import LawConfig, reads
 from cotap.envs.upper_body import UpperBodyConfig
 from cotap.evaluation.policy import find_checkpoint, load_policy
-from cotap.evaluation.wrong_model import misjudged_arms
 from cotap.robots.chains import arm_model
 from reports import compare_laws
+from reports.wrong_model import misjudged_arms
 
 
 def test_a_wrong_model_is_longer_and_heavier(spec):

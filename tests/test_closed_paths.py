@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from cotap.compliance.laws import LawConfig
-from cotap.evaluation.closed_paths import circles, lead, spring_of
 from cotap.robots.chains import arm_model
 from reports import closed_paths as script
+from reports.led_hands import circles, lead, spring_of
 
 SOFT = (300.0, 300.0, 300.0)
 
