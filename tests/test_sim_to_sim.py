@@ -28,7 +28,7 @@ from cotap.evaluate import parse
 from cotap.evaluation.disturbance import ConstantLoad, Impact
 from cotap.evaluation.law_options import parse_law
 from cotap.evaluation.policy import shipped_checkpoint
-from cotap.robots import ROBOTS, RobotSpec
+from cotap.robots import RobotSpec
 from reports import sim_to_sim as script
 from reports.paper import engines
 from reports.paper.arms import arms as impact_arms
@@ -288,7 +288,7 @@ def test_laws_are_those_of_the_tables_of_the_evaluation(robot):
     """As `cotap evaluate` reads the options of the paper's tables, for a policy trained in another way."""
     trained = LawConfig("cotap", (80.0,) * 3, 33.0, 0.4, damping="pd", error="task")
     tables = {"impact": impact_arms(robot), "constant-load": LOADS}
-    for part, laws in laws_by_part(ROBOTS[robot]()).items():
+    for part, laws in laws_by_part(robot).items():
         for label, text in laws.items():
             asked = parse(["impact", *tables[part][label]]).laws.configure(UpperBodyConfig(trained, trained)).left
             found = parse_law("left", text, trained)

@@ -40,6 +40,8 @@ from cotap.evaluation.report import pyplot
 from cotap.motions.elbow import elbow_index
 from cotap.motions.reference import HELD, MIXTURE
 from cotap.robots import RobotSpec
+from reports.paper.arms import NULL_STIFFNESS, soft_gain
+from reports.paper.periodic import LEFT
 from reports.paper.workers import Workers
 
 STAND = (TimedCommand(stand=True),)
@@ -60,10 +62,6 @@ APART = Perturbations(start_error=0.02)
 SWINGS = ("elbow_torque_nm", "elbow_torque_statics_nm", "hand_swing_m", "hand_swing_statics_m")
 """Amplitudes under the periodic load, and what statics makes of them; null where no trial stood."""
 HELD_ARMS = "arms held"
-SOFT_SHARE = 0.3
-"""Gain of the paper's soft PD over the largest of its PD's."""
-NULL = "null_stiffness=25"
-"""The paper's in its evaluation [Nm/rad]."""
 
 
 @dataclass
@@ -146,7 +144,7 @@ def _parts(policy: OnnxPolicy, cfg: Comparison, run: Run) -> dict[str, Callable[
     spec, trained = robot_of(policy.metadata), law_config(policy.metadata)
     impact, load = Impact(onset=ONSET_S, episode_seconds=ONSET_S + 2.0), ConstantLoad(onset=ONSET_S)
     load.episode_seconds = ONSET_S + 4.0
-    walk, laws = Scenario(cfg.episode_seconds, cfg.arms), laws_by_part(spec)
+    walk, laws = Scenario(cfg.episode_seconds, cfg.arms), laws_by_part(policy.metadata.robot)
     return {
         "velocity-tracking": lambda: tracking(run(walk, cfg.trials), policy, cfg),
         "impact": lambda: loads(run, spec, impact, laws["impact"], cfg, trained),
@@ -186,14 +184,14 @@ def tracking(trials: list[Trial], policy: OnnxPolicy, cfg: Comparison) -> dict[s
     return falls(trials) | {"metrics": {name: summarize(measures[name], cfg.seed) for name in names}}
 
 
-def laws_by_part(spec: RobotSpec) -> dict[str, dict[str, str]]:
+def laws_by_part(robot: str) -> dict[str, dict[str, str]]:
     """Laws that impact and constant load compare, by name: those of the paper's Table III and Fig. 4."""
-    soft = SOFT_SHARE * max(joint.kp for joint in spec.joints if joint.name in spec.upper_joints)
-    struck = {f"K {k}": f"cotap:stiffness={k}x{k}x300,{NULL}" for k in (100, 500, 800)}
-    loaded = {f"K_z {k}": f"cotap:stiffness=300x300x{k},{NULL}" for k in (100, 500, 1000)}
+    null = f"null_stiffness={NULL_STIFFNESS}"
+    struck = {f"K {k}": f"cotap:stiffness={k}x{k}x300,{null}" for k in (100, 500, 800)}
+    loaded = {f"K_z {k}": f"cotap:stiffness=300x300x{k},{null}" for k in (100, 500, 1000)}
     return {
         "impact": {
-            "PD": "pd", "soft PD": f"soft-pd:soft_gain={soft:g}", **struck,
+            "PD": "pd", "soft PD": f"soft-pd:soft_gain={soft_gain(robot):g}", **struck,
             "alpha 0.7, K 100": f"{struck['K 100']},alpha=0.7",
         },
         "constant-load": {"PD": "pd", **loaded, "alpha 0.5": f"{loaded['K_z 100']},alpha=0.5"},
@@ -235,8 +233,7 @@ def periodic(
     A slow load asks for joint torque `J^T F` whatever the stiffness, and moves the hand by `J K^-1 J^T F`. Of trials
     that stood.
     """
-    left = replace(trained.left, name="cotap", stiffness=(500.0, 500.0, 500.0), null_stiffness=25.0, alpha=0.7)
-    laws = replace(trained, left=left, right=LawConfig("pd"))
+    laws = replace(trained, left=parse_law("left", LEFT, trained.left), right=LawConfig("pd"))
     load = ForceProfile((0.0, 0.0, amplitude), "both", ONSET_S, period_s=period)
     seconds = ONSET_S + 3.0 * period
     trials = run(Scenario(seconds, command=STAND, force=(load,)), cfg.load_trials, laws, APART)
