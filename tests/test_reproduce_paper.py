@@ -252,7 +252,7 @@ def test_a_walk_is_no_worse_within_a_tenth_or_the_interval():
 
 
 def test_only_evaluations_of_the_same_policy_and_settings_are_kept(book, monkeypatch):
-    """Neither one of another checkpoint nor one of other envs or options is taken for what was asked for."""
+    """None of another checkpoint or of other options, and no broken file, is taken for what was asked for."""
     asked = []
     book.policies["base"] = str(save_random_policy(book.folder / "policy.pt"))
 
@@ -266,14 +266,16 @@ def test_only_evaluations_of_the_same_policy_and_settings_are_kept(book, monkeyp
     written = json.loads(path.read_text())
     assert "--per-env" in written["about"]["arguments"]
     book.reuse = True
-    for changed, kept in (
-        ({}, True),
-        ({"about": written["about"] | {"checkpoint_sha256": "other"}}, False),
-        ({"about": written["about"] | {"arguments": [*written["about"]["arguments"], "--seed", "1"]}}, False),
-    ):
+    about = written["about"]
+    for text, kept in (
+        (json.dumps(written), True),
+        (json.dumps(written | {"about": about | {"checkpoint_sha256": "other"}}), False),
+        (json.dumps(written | {"about": about | {"arguments": [*about["arguments"], "--seed", "1"]}}), False),
+        ("{", False), ("[1]", False), ("{}", False),
+    ):  # fmt: skip
         asked.clear()
         book.results.clear()
-        path.write_text(json.dumps(written | changed))
+        path.write_text(text)
         book.run("row", "base", "impact", "--alpha", "0.5")
         assert (not asked) == kept
     assert str(book.folder) not in json.dumps(book.summary())

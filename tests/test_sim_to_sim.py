@@ -188,7 +188,7 @@ def test_a_small_comparison_is_written_whole(tmp_path, monkeypatch):
         script.main([*arguments, "--seed", "1"])
 
 
-def test_parts_are_run_as_they_ask_and_otherwise_as_the_policy_was_trained(policy, policy_file, monkeypatch):
+def test_parts_are_run_as_they_ask_and_otherwise_as_the_policy_was_trained(policy, policy_file, tmp_path, monkeypatch):
     asked = []
 
     class Recorder:
@@ -213,7 +213,7 @@ def test_parts_are_run_as_they_ask_and_otherwise_as_the_policy_was_trained(polic
 
     monkeypatch.setattr(engines, "Workers", Recorder)
     monkeypatch.setattr(engines, "_parts", parts)
-    result = compare(policy_file, Comparison(engines=("mujoco",), seed=7, timestep=0.002))
+    result = compare(policy_file, Comparison(engines=("mujoco",), seed=7, timestep=0.002), 1, tmp_path)
     engine, safety = EngineConfig("mujoco", 0.002), SafetyConfig()
     assert asked == [
         ((law_config(policy.metadata), engine, Perturbations(), safety, Scenario(1.0)), 3, 7),

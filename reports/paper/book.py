@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -168,13 +169,15 @@ def kept_or_run(path: Path, arguments: list[str], checkpoint: str, threads: int,
 
 
 def kept(path: Path, reuse: bool, about: dict[str, Any], measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """What `measure` returns, written to `path`; with `reuse`, what `path` has, if it is `about` the same."""
+    """What `measure` returns, written to `path`; with `reuse`, what `path` has, if that is `about` the same."""
     from cotap.agents.checkpoint import write_json
 
     about = json.loads(json.dumps(about))  # as it is read back
-    before = json.loads(path.read_text()) if reuse and path.is_file() else {}
-    if before.get("about") == about:
-        return before
+    if reuse and path.is_file():
+        with contextlib.suppress(ValueError, TypeError, LookupError, RecursionError):  # no such file: measured again
+            before = json.loads(path.read_text(encoding="utf-8"))
+            if before["about"] == about:
+                return before
     print(f"\n{path.stem}", flush=True)
     result = measure() | {"about": about}
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -6,8 +6,6 @@ those of the evaluation's tables.
 
 from __future__ import annotations
 
-import contextlib
-import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,7 +14,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from cotap.agents.checkpoint import write_json
 from cotap.checks import require_positive_int, require_range
 from cotap.compliance.laws import LawConfig
 from cotap.configs import to_plain
@@ -41,6 +38,7 @@ from cotap.motions.elbow import elbow_index
 from cotap.motions.reference import HELD, MIXTURE
 from cotap.robots import RobotSpec
 from reports.paper.arms import NULL_STIFFNESS, soft_gain
+from reports.paper.book import kept
 from reports.paper.periodic import LEFT
 from reports.paper.workers import Workers
 
@@ -109,17 +107,18 @@ class Comparison:
 Run = Callable[..., list[Trial]]
 
 
-def compare(path: Path, cfg: Comparison, jobs: int = 1, kept: Path | None = None) -> dict[str, Any]:
+def compare(path: Path, cfg: Comparison, jobs: int, parts: Path) -> dict[str, Any]:
     """Run everything. Returns what the report is written from; it does not depend on `jobs`.
 
     Args:
         path: The policy.
         cfg: What is run.
         jobs: How many processes share the trials.
-        kept: Folder in which parts that are done are kept, and found again if they were run with the same settings.
+        parts: Folder in which parts that are done are kept, and found again if they were run with the same settings.
     """
     policy = OnnxPolicy(path)
     about = to_plain(cfg) | {"checkpoint_sha256": policy.metadata.checkpoint_sha256}
+    alone = {k: v for k, v in about.items() if k != "engines"}  # no engine's parts depend on which others there are
     result: dict[str, Any] = {"settings": about, "dt": policy.metadata.control_dt, "engines": {}}
     with Workers(path, jobs) as workers:
         for name in cfg.engines:
@@ -135,7 +134,8 @@ def compare(path: Path, cfg: Comparison, jobs: int = 1, kept: Path | None = None
                 )
 
             for part, measure in _parts(policy, cfg, run).items():
-                done[part] = _keep(kept / f"{name}-{part}.json" if kept else None, about, measure)
+                found = kept(parts / f"{name}-{part}.json", True, alone, lambda of=measure: {"result": of()})
+                done[part] = found["result"]
     return result
 
 
@@ -154,21 +154,6 @@ def _parts(policy: OnnxPolicy, cfg: Comparison, run: Run) -> dict[str, Callable[
             label: falls(run(walk, cfg.perturbed_trials, wrong=wrong)) for label, wrong in PERTURBATIONS.items()
         },
     }
-
-
-def _keep(path: Path | None, about: dict[str, Any], measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """What `measure` returns; from `path` if it is there and about the same."""
-    # What is run in one engine does not depend on which others there are.
-    about = json.loads(json.dumps({name: value for name, value in about.items() if name != "engines"}))
-    if path and path.is_file():
-        with contextlib.suppress(ValueError, RecursionError):  # not JSON: run it again
-            before = json.loads(path.read_text(encoding="utf-8"))
-            if before.get("about") == about:
-                return before["result"]
-    result = measure()
-    if path:
-        write_json(path, {"about": about, "result": result})
-    return result
 
 
 def falls(trials: list[Trial]) -> dict[str, Any]:
