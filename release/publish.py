@@ -19,10 +19,11 @@ from cotap.agents.checkpoint import load_checkpoint, require_parts, save_checkpo
 from cotap.checks import require_positive_int
 from cotap.evaluate import main as evaluate
 from cotap.evaluation.policy import CHECKPOINTS, checkpoint_path, find_checkpoint
+from cotap.motions.reference import ClipConfig
+from cotap.train import runs_of
 from release.recipe import require_default
 
 TRACKING, ENVS = "velocity-tracking", "ENVS"
-HELD_OUT = ("dance_b", "dance_b_mirrored", "kick", "kick_mirrored")
 PUSHES = {"base-25": ("base", "500"), "base-50": ("base", "1000"), "hand-25": ("hand", "500")}
 """Where a push of 50 ms acts, and its force [N], by place and impulse [N s]."""
 
@@ -36,7 +37,7 @@ def pushed(place: str, force: str, mode: str) -> list[str]:
 EVALUATIONS: dict[str, list[str]] = {
     TRACKING: [TRACKING, "--num-envs", ENVS],
     f"{TRACKING}.hand-loads": [TRACKING, "--num-envs", ENVS, "--hand-loads"],
-    f"{TRACKING}.held-out": [TRACKING, "--num-envs", ENVS, "--motion", *HELD_OUT],
+    f"{TRACKING}.held-out": [TRACKING, "--num-envs", ENVS, "--motion", *ClipConfig.held_out],
     f"{TRACKING}.reference-arms": [TRACKING, "--num-envs", ENVS, "--upper-actions", "reference"],
     **{f"impact.{name}.{mode}": pushed(*push, mode) for name, push in PUSHES.items() for mode in ("stance", "walking")},
     **{
@@ -70,13 +71,11 @@ def without_folder(value: Any, folder: str) -> Any:
 def description(target: Path, content: dict[str, Any], headlines: dict[str, Any]) -> dict[str, Any]:
     """What NAME.json says."""
     config = content["config"]
-    last = {key: config[key] for key in ("command", "commit")} | {"samples": content["samples"]}
-    runs = [*config.get("earlier_runs", []), last]
     return {
         "sha256": sha256(target),
         "robot": content["layout"]["robot"],
         "stage": content["kind"],
-        "runs": runs,
+        "runs": runs_of(content),
         **({"base": config["base"]} if "base" in config else {}),
         "command": config["command"],
         "commit": config["commit"],

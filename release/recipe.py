@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
+from cotap.compare import flat
 from cotap.configs import BASE_RECIPES, DISTILL_RECIPES, to_plain
 
 OF_A_RUN = {
@@ -20,8 +21,8 @@ def require_default(content: dict[str, Any]) -> None:
     A field that came after the run has its default: what the run did.
     """
     asked_for = recipe(content["config"])
-    trained, asked = fields(content["config"]["training"]), fields(json.loads(json.dumps(to_plain(asked_for))))
-    trained = fields(json.loads(json.dumps(to_plain(type(asked_for)())))) | trained
+    trained, asked = flat(content["config"]["training"]), flat(json.loads(json.dumps(to_plain(asked_for))))
+    trained = flat(json.loads(json.dumps(to_plain(type(asked_for)())))) | trained
     changed = {
         name: (trained.get(name), asked.get(name))
         for name in sorted(trained.keys() | asked.keys())
@@ -39,10 +40,3 @@ def recipe(config: dict[str, Any]) -> Any:
         return base
     base.train_for(config["base"]["runs"][-1]["samples"])
     return DISTILL_RECIPES["default"](base)
-
-
-def fields(value: Any, name: str = "") -> dict[str, Any]:
-    """The leaves of nested plain data, by dotted name."""
-    if not isinstance(value, dict):
-        return {name: value}
-    return {k: v for key, inner in value.items() for k, v in fields(inner, f"{name}.{key}".lstrip(".")).items()}

@@ -120,7 +120,7 @@ def compare(a: dict[str, Any], b: dict[str, Any], without_falls: bool = False) -
     if not names:
         raise ValueError(f"the evaluations have no measure in common in {key}")
     rows = {name: judged(name, measure_difference(a, b, name, without_falls)) for name in names}
-    old, new = (_flat(x["settings"] | {"method": x.get("method"), "window": x.get("window")}) for x in (a, b))
+    old, new = (flat(x["settings"] | {"method": x.get("method"), "window": x.get("window")}) for x in (a, b))
     settings = {
         name: [old.get(name), new.get(name)]
         for name in sorted(old.keys() | new.keys())
@@ -192,13 +192,13 @@ def difference(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
     return {"a": a["mean"], "b": b["mean"], "difference": d, "ci95": [low, high]}
 
 
-def _flat(tree: Any, prefix: str = "") -> dict[str, Any]:
+def flat(tree: Any, prefix: str = "") -> dict[str, Any]:
     """Nested dicts as one, keys joined by dots."""
     if not isinstance(tree, dict):
         return {prefix: tree}
     out: dict[str, Any] = {}
     for key, value in tree.items():
-        out |= _flat(value, f"{prefix}.{key}" if prefix else str(key))
+        out |= flat(value, f"{prefix}.{key}" if prefix else str(key))
     return out
 
 

@@ -342,11 +342,11 @@ def _origin(options: BaseOptions | DistillOptions) -> dict[str, Any]:
     content = load_checkpoint(before)
     older = {"base": content["config"]["base"]} if "base" in content["config"] else {}
     if options.resume:
-        return {"earlier_runs": _runs(content), **older}
-    return {"base": {"sha256": sha256(before), "runs": _runs(content), **older}}
+        return {"earlier_runs": runs_of(content), **older}
+    return {"base": {"sha256": sha256(before), "runs": runs_of(content), **older}}
 
 
-def _runs(content: dict[str, Any]) -> list[dict[str, Any]]:
+def runs_of(content: dict[str, Any]) -> list[dict[str, Any]]:
     """Command, commit and last sample of every run that a checkpoint comes from, the first one first."""
     config = content["config"]
     last = {name: config.get(name, "") for name in ("command", "commit")} | {"samples": content.get("samples", 0)}
