@@ -25,6 +25,7 @@ from cotap.evaluation.stability import random_poses
 from cotap.files import write_atomically
 from cotap.robots import ROBOTS
 from cotap.robots.chains import arm_model
+from reports.cells import cell
 from reports.led_hands import circles, lead, spring_of
 
 
@@ -99,10 +100,9 @@ def table(result: dict[str, Any]) -> str:
         "|---|---|---|---|---|---|",
     ]
     for name, row in result["rows"].items():
-        low, high = row["drawn"]["ci95"]
         lines.append(
-            f"| {name} | {row['drawn']['n']} | {row['drawn']['mean']:.3f} ({low:.3f} to {high:.3f}) "
-            f"| {row['largest']:.2f} | {row['stored']['mean']:.2f} | {row['asymmetry']['mean']:.1%} |"
+            f"| {name} | {row['drawn']['n']} | {cell(row['drawn'])} | {row['largest']:.2f} "
+            f"| {row['stored']['mean']:.2f} | {row['asymmetry']['mean']:.1%} |"
         )
     o = result["settings"]
     about = (

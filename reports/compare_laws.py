@@ -35,6 +35,7 @@ from cotap.evaluation.rollout import idle
 from cotap.evaluation.stability import Stability, energy_summary, exchanged_energy, growth_rates
 from cotap.evaluation.static import StaticStiffness, settle
 from cotap.files import write_atomically
+from reports.cells import cell
 from reports.law_figures import draw_properties, draw_static, draw_transient
 from reports.paper.tables import PROPERTIES, STATIC
 from reports.wrong_model import misjudge
@@ -242,7 +243,7 @@ class Transient:
             ]  # fmt: skip
             for name, row in rows.items():
                 shown = [
-                    _cell(row["metrics"][key], digits)
+                    cell(row["metrics"][key], digits)
                     for key, digits in (
                         ("e_ee_hit", 3), ("share_at_limit", 2), ("transient_energy", 2), ("oscillation_energy", 3),
                         ("overshoot", 2), ("overshoots", 1), ("settle_s", 2),
@@ -256,13 +257,6 @@ class Transient:
     def draw(self, result: dict[str, Any]) -> Any:
         """The hand's displacement along the push over time."""
         return draw_transient(result)
-
-
-def _cell(m: dict[str, Any], digits: int) -> str:
-    if m["mean"] is None:
-        return "-"
-    low, high = m["ci95"]
-    return f"{m['mean']:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
 
 
 def _verdicts(rows: dict[str, Any]) -> list[str]:

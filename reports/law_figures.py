@@ -9,15 +9,9 @@ import numpy as np
 from cotap.evaluation.report import pyplot
 
 
-def _pyplot() -> Any:
-    plt = pyplot()
-
-    return plt
-
-
 def draw_static(result: dict[str, Any]) -> Any:
     """Displacement of the hand against load, law by law, with the paper's ideal."""
-    plt = _pyplot()
+    plt = pyplot()
     loads = result["loads_n"]
     figure, axis = plt.subplots(figsize=(8.5, 4.6), constrained_layout=True)
     axis.plot(loads, result["ideal"], "k--", lw=1.5, label="ideal")
@@ -33,7 +27,7 @@ def draw_static(result: dict[str, Any]) -> Any:
 
 def draw_transient(result: dict[str, Any], until_s: float = 1.5) -> Any:
     """Displacement of the struck hand over time, mean and standard deviation over envs: a panel per law and force."""
-    plt = _pyplot()
+    plt = pyplot()
     forces = result["forces"]
     columns = max(len(rows) for rows in forces.values())
     size = (2.3 * columns + 0.6, 2.2 * len(forces) + 0.4)
@@ -62,7 +56,7 @@ def draw_transient(result: dict[str, Any], until_s: float = 1.5) -> Any:
 
 def draw_properties(result: dict[str, Any]) -> Any:
     """Bars per law: adjustable, model-aware, unstable poses by wall, trials that energy is drawn from."""
-    plt = _pyplot()
+    plt = pyplot()
     rows = result["rows"]
     at = np.arange(len(rows))[::-1]
     figure, axes = plt.subplots(1, 4, figsize=(13.0, 0.34 * len(rows) + 1.4), sharey=True, constrained_layout=True)

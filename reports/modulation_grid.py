@@ -37,6 +37,7 @@ from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.protocol import Protocol
 from cotap.evaluation.task import PARTS, Task
 from cotap.files import write_atomically
+from reports.cells import cell
 
 SHOWN = ("return", *PARTS, "alpha", "stiffness", "fall_fraction")
 """Columns of the table of settings."""
@@ -237,14 +238,7 @@ def _named(setting: Setting) -> str:
 
 
 def _row(label: str, row: dict[str, Any]) -> str:
-    return f"| {label} | {' | '.join(_cell(row['metrics'][name]) for name in SHOWN)} |"
-
-
-def _cell(m: dict[str, Any]) -> str:
-    if m["mean"] is None:
-        return "-"
-    low, high = m["ci95"]
-    return f"{m['mean']:.3f} ({low:.3f} to {high:.3f})"
+    return f"| {label} | {' | '.join(cell(row['metrics'][name]) for name in SHOWN)} |"
 
 
 def _gained(d: dict[str, Any]) -> str:

@@ -35,6 +35,7 @@ from cotap.files import write_atomically
 from cotap.robots import ROBOTS
 from cotap.robots.chains import arm_model
 from reports.arm_motion import Motion, Pulled, rates
+from reports.cells import cell
 
 DT = 0.02
 LIMITS = Limits(force=15.0, brake=40.0, stiffness=(80.0, 1200.0), seconds=math.nan)
@@ -216,8 +217,8 @@ def table(result: dict[str, Any]) -> str:
     ]
     for name, row in result["rows"].items():
         lines.append(
-            f"| {name} | {row['episodes']} | {_interval(row['drawn'])} | {row['largest']:.3f} "
-            f"| {row['lowest_store']:.3f} | {_interval(row['drawn_without'])} | {row['largest_without']:.2f} "
+            f"| {name} | {row['episodes']} | {cell(row['drawn'])} | {row['largest']:.3f} "
+            f"| {row['lowest_store']:.3f} | {cell(row['drawn_without'])} | {row['largest_without']:.2f} "
             f"| {row['rate_condition_met']:.1%}, {row['rate_condition_met_without']:.1%} |"
         )
     o = result["settings"]
@@ -227,11 +228,6 @@ def table(result: dict[str, Any]) -> str:
         "speed; float64. The rate condition is that of Kronander and Billard, checked on every change that was made."
     )
     return "\n".join([*lines, "", about])
-
-
-def _interval(cell: dict[str, Any]) -> str:
-    low, high = cell["ci95"]
-    return f"{cell['mean']:.3f} ({low:.3f} to {high:.3f})"
 
 
 def main(argv: list[str] | None = None) -> int:

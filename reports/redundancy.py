@@ -13,8 +13,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from cotap import robots
 from reports.paper import constant_load, periodic
-from reports.paper.arms import COMPLIANT, mass
+from reports.paper.arms import COMPLIANT
 from reports.paper.book import row
 from reports.paper.words import LABELS, hundredfold, number
 
@@ -135,7 +136,7 @@ def page(h1: dict[str, Any], g1: dict[str, Any]) -> str:
                 verdicts[NAMES[measure]][found] += 1
                 lines.append(row(NAMES[measure], arms, *map(hundredfold, pair), found))
     total = sum(verdicts.values(), Counter[str]())
-    weights = dict(zip(ROBOTS, map(mass, ROBOTS), strict=True))
+    weights = {name: robots.ROBOTS[name]().mass_kg for name in ROBOTS}
     counts = [row(name, *(str(found[v]) for v in VERDICTS)) for name, found in verdicts.items()]
     head = [HEAD.format(answer=answer(total), **weights), "", row("measure", *VERDICTS), "|---" * 5 + "|", *counts]
     return "\n".join([*head, "", WHY, *causes(h1, g1), *lines, ""])

@@ -54,11 +54,6 @@ def soft_gain(robot: str) -> float:
     return SOFT_SHARE * max(_gains(robot))
 
 
-def mass(robot: str) -> float:
-    """Of the whole robot [kg]."""
-    return sum(body.mass_kg for body in ROBOTS[robot]().bodies)
-
-
 def _gains(robot: str) -> list[float]:
     spec = ROBOTS[robot]()
     return [joint.kp for joint in spec.joints if joint.name in spec.upper_joints]

@@ -37,6 +37,7 @@ from cotap.evaluation.report import pyplot
 from cotap.motions.elbow import elbow_index
 from cotap.motions.reference import HELD, MIXTURE
 from cotap.robots import RobotSpec
+from reports.cells import cell
 from reports.paper.arms import NULL_STIFFNESS, soft_gain
 from reports.paper.book import kept
 from reports.paper.periodic import LEFT
@@ -288,7 +289,7 @@ def markdown(result: dict[str, Any]) -> str:
     ]
     lines.append("| trials that fell | " + " | ".join(_falls(e["velocity-tracking"]) for e in engines.values()) + " |")
     for name in next(iter(engines.values()))["velocity-tracking"]["metrics"]:
-        row = [_mean(e["velocity-tracking"]["metrics"][name]) for e in engines.values()]
+        row = [cell(e["velocity-tracking"]["metrics"][name]) for e in engines.values()]
         lines.append(f"| {name} | " + " | ".join(row) + " |")
     for part, title, arms in (
         ("impact", "Impact of 500 N for 0.05 s", moving), ("constant-load", "Constant load of -50 N", HELD_ARMS),
@@ -299,8 +300,8 @@ def markdown(result: dict[str, Any]) -> str:
         for name, e in engines.items():
             for label, row in e[part].items():
                 m = row["metrics"]
-                shown = " | ".join(_mean(m[k]) for k in ("e_torso", "e_ee_hit", "j_upper"))
-                lines.append(f"| {name} | {label} | {_falls(row)} | {shown} | {_mean(row['displacement_z'])} |")
+                shown = " | ".join(cell(m[k]) for k in ("e_torso", "e_ee_hit", "j_upper"))
+                lines.append(f"| {name} | {label} | {_falls(row)} | {shown} | {cell(row['displacement_z'])} |")
     lines += ["", f"## Periodic load of 30 N, 4 s, both hands, {HELD_ARMS}: left alpha 0.7 at 500 N/m, right PD", ""]
     lines += [
         "| engine | arm | elbow torque [Nm] | of it statics | hand swing [m] | of it statics |",
@@ -320,10 +321,6 @@ def markdown(result: dict[str, Any]) -> str:
 def _falls(row: dict[str, Any]) -> str:
     low, high = row["ci95"]
     return f"{row['falls']} of {row['trials']} ({100 * low:.0f} to {100 * high:.0f} %)"
-
-
-def _mean(m: dict[str, Any]) -> str:
-    return "-" if m["mean"] is None else f"{m['mean']:.3f} ({m['ci95'][0]:.3f} to {m['ci95'][1]:.3f})"
 
 
 def figure(result: dict[str, Any], path: Any) -> None:

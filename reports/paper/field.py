@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from reports.paper.arms import CALM, PD, label, mass
+from cotap.robots import ROBOTS
+from reports.paper.arms import CALM, PD, label
 from reports.paper.book import Book
 from reports.paper.words import hundredfold, missing
 
@@ -68,7 +69,7 @@ def field(book: Book) -> None:
     )
     for cells in ROWS:
         book.row(*cells)
-    book.paragraph(OTHERS, robot=book.robot.upper(), mass=mass(book.robot))
+    book.paragraph(OTHERS, robot=book.robot.upper(), mass=ROBOTS[book.robot]().mass_kg)
 
 
 def upright(result: dict[str, Any]) -> str:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from reports.paper.arms import CALM, COMPLIANT, PD, SOFT, arms, label, mass
+from cotap.robots import ROBOTS
+from reports.paper.arms import CALM, COMPLIANT, PD, SOFT, arms, label
 from reports.paper.book import Book, slug
 from reports.paper.relative import keep_changes
 from reports.paper.tables import IMPACT, ORDERINGS, PAPER_ROBOT
@@ -129,7 +130,7 @@ def stance(book: Book) -> None:
 
 def walking(book: Book) -> None:
     """Where ours differs in walking."""
-    k100, impulse, weight = key("walking", "K 100"), FORCE_N * DURATION_S, mass(PAPER_ROBOT)
+    k100, impulse, weight = key("walking", "K 100"), FORCE_N * DURATION_S, ROBOTS[PAPER_ROBOT]().mass_kg
     book.paragraph(
         WALKING,
         paper=the_paper(book),
@@ -184,7 +185,7 @@ def without_limits(book: Book) -> None:
 
 def by_mass(book: Book) -> None:
     """The impact of an impulse that is to this robot's mass as the paper's is to H1's."""
-    force = FORCE_N * mass(book.robot) / mass(PAPER_ROBOT)
+    force = FORCE_N * ROBOTS[book.robot]().mass_kg / ROBOTS[PAPER_ROBOT]().mass_kg
     book.add("", "### Impulse by mass")
     few_columns(book, "by-mass", MODES, (PD, *COMPLIANT), ["--force", f"{force:.1f}", "0", "0"])
     book.paragraph(BY_MASS, impulse=round(force * DURATION_S, 1))
