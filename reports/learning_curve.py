@@ -199,7 +199,7 @@ def plot(path: Path, rows: list[Row], options: Options) -> None:
         ):
             for run, own in by_run(rows).items():
                 points = [(row[key] / unit, y) for row in own if (y := value(row, name)) is not None]
-                axis.plot(*zip(*points, strict=True), "o-", ms=3, label=run)
+                axis.plot([x for x, _ in points], [y for _, y in points], "o-", ms=3, label=run)
             if name in ("slope_x", "falls"):
                 axis.axhline(options.slope if name == "slope_x" else options.falls, color="0.4", ls="--", lw=1)
             axis.set(xlabel=title, ylabel=COLUMNS[name])

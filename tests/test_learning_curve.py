@@ -122,11 +122,14 @@ def test_the_plot_has_a_panel_for_each_measure_over_samples_and_hours(tmp_path, 
     monkeypatch.setattr(learning_curve, "save_figure", lambda figure, _: figures.append(figure))
     measures = {"velocity-tracking": {"slope_x": 0.5, "falls": 0.1}, "tour": {"survival_s": None}}
     row = {"run": "a", "samples": 2_000_000, "wall_seconds": 7200.0, "measures": measures}
-    learning_curve.plot(tmp_path / "x.png", [row], learning_curve.Options(("a",)))
+    bare = row | {"run": "b", "measures": {"velocity-tracking": {"slope_x": None, "falls": 0.3}}}
+    learning_curve.plot(tmp_path / "x.png", [bare, row], learning_curve.Options(("b", "a")))
     axes = figures[0].axes
     assert [a.get_xlabel() for a in axes] == ["samples [M]", "hours"] * 2
-    assert [a.lines[0].get_xydata().tolist() for a in axes[:2]] == [[[2.0, 0.5]]] * 2
-    assert [a.lines[1].get_ydata()[0] for a in axes] == [0.85, 0.85, 0.02, 0.02]
+    drawn = [[line.get_xydata().tolist() for line in a.lines[:2]] for a in axes]
+    assert drawn == [[[], [[2.0, 0.5]]]] * 2 + [[[[2.0, 0.3]], [[2.0, 0.1]]]] * 2  # nothing that was not measured
+    assert [a.lines[2].get_ydata()[0] for a in axes] == [0.85, 0.85, 0.02, 0.02]
+    assert [text.get_text() for text in axes[0].get_legend().get_texts()] == ["b", "a"]
 
 
 def test_checkpoints_are_taken_at_every_multiple():
