@@ -120,14 +120,18 @@ def expected(options: PipelineOptions) -> str:
     """What both stages will take on this machine, by one iteration of each, as a Markdown table."""
     import torch
 
+    from cotap.agents.distillation import Guide
     from cotap.agents.timing import TimedTraining
     from cotap.envs import HumanoidEnv
 
     if options.threads:
         torch.set_num_threads(options.threads)
     lines = ["| stage | samples | samples/s here | hours |", "|---|---|---|---|"]
-    for stage, training in zip(STAGES, options._trainings(), strict=True):
-        timed = TimedTraining(HumanoidEnv(training.env), training.ppo, options.device)
+    base, distill = options._trainings()
+    walking = TimedTraining(HumanoidEnv(base.env), base.ppo, options.device)
+    guide = Guide(walking.alg.model, distill.distillation)
+    complying = TimedTraining(HumanoidEnv(distill.env), distill.ppo, options.device, guide)
+    for stage, training, timed in zip(STAGES, (base, distill), (walking, complying), strict=True):
         timed.run()  # warm up
         rate = timed.run()
         hours = training.samples / rate / 3600.0
