@@ -94,8 +94,7 @@ def reference_model(robot: str = "h1") -> mujoco.MjModel:
 
 def recipe(robot: str, stage: str = "base") -> BaseTraining:
     """Recipe `default` of a stage."""
-    training = BASE_RECIPES["default"]()
-    training.env.robot = robot
+    training = BASE_RECIPES["default"](robot)
     return training if stage == "base" else DISTILL_RECIPES["default"](training)
 
 
@@ -445,7 +444,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     train_env = full_env(num_envs, options.threads, robot=robot)
     networks = {"default": "train", "paper": "train_paper"}
     for kind in options.networks:
-        training = TimedTraining(train_env, BASE_RECIPES[kind]().ppo)
+        training = TimedTraining(train_env, BASE_RECIPES[kind](robot).ppo)
         parts[networks[kind]] = training.run
         if kind == "default":
             distill = recipe(robot, "distill")

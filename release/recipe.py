@@ -35,7 +35,7 @@ def require_default(content: dict[str, Any]) -> None:
 
 def recipe(config: dict[str, Any]) -> Any:
     """The recipe `default` of a run's stage, on a base of as many samples as its own."""
-    base = BASE_RECIPES["default"]()
+    base = BASE_RECIPES["default"](config["training"]["env"]["robot"])
     if config["stage"] == "base":
         return base
     base.train_for(config["base"]["runs"][-1]["samples"])

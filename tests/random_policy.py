@@ -13,8 +13,8 @@ from cotap.envs import HumanoidEnv
 
 def save_random_policy(path: Path, stage: str = "base", robot: str = "h1", seed: int = 0) -> Path:
     """A checkpoint of the recipe `default` of a stage with tiny random networks, as training saves it."""
-    training = BASE_RECIPES["default"]()
-    training.env.robot, training.env.num_envs, training.env.num_threads = robot, 2, 1
+    training = BASE_RECIPES["default"](robot)
+    training.env.num_envs, training.env.num_threads = 2, 1
     training.ppo.hidden, training.ppo.steps, training.seed = (8, 8), 4, seed
     if stage == "distill":
         training = DISTILL_RECIPES["default"](training)

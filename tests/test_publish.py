@@ -86,8 +86,8 @@ def test_a_policy_is_published_under_its_own_name_only(tmp_path: Path, package: 
 
 def of_default(stage: str) -> dict[str, Any]:
     """A checkpoint's config of a run of the recipe `default`, whose base had 60 M samples."""
-    training = BASE_RECIPES["default"]()
-    training.env.robot, training.threads, training.seed = "g1", 1, 3
+    training = BASE_RECIPES["default"]("g1")
+    training.threads, training.seed = 1, 3
     config: dict[str, Any] = {"stage": stage}
     if stage == "distill":
         training.train_for(60e6)

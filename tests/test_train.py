@@ -417,6 +417,16 @@ def test_recipe_sets_the_defaults(monkeypatch: pytest.MonkeyPatch, recipe: str):
     assert options.recipe == recipe
 
 
+def test_a_recipe_is_for_the_robot_that_is_asked_for_and_options_come_on_top(monkeypatch: pytest.MonkeyPatch):
+    expected = BASE_RECIPES["default"]("g1")
+    assert expected.env.actions != BASE_RECIPES["default"]().env.actions
+    assert captured(monkeypatch, "base", "--robot", "g1").training == expected
+    expected.env.actions.waist_share = 0.7
+    asked = ["--robot=g1", "--env.actions.waist-share", 0.7]
+    assert captured(monkeypatch, "base", *asked).training == expected
+    assert PipelineOptions(robot="g1")._trainings()[0].env.actions.waist_share == 0.5
+
+
 @pytest.mark.parametrize(
     ("given", "iterations"),
     [([], 12_207), ([ENVS, 4096], 3051), ([STEPS, 48], 6103), ([ENVS, 4096, ITERATIONS, 7], 7), ([ITERATIONS, 7], 7)],

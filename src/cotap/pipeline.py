@@ -72,10 +72,10 @@ class PipelineOptions:
 
     def _trainings(self) -> tuple[BaseTraining, DistillTraining]:
         """Both configurations."""
-        base = BASE_RECIPES[self.chosen]()
+        base = BASE_RECIPES[self.chosen](self.robot)
         samples = base.samples
         base.seed, base.threads, base.device = self.seed, self.threads, self.device
-        base.env.robot, base.env.backend, base.env.num_threads = self.robot, self.backend, self.threads
+        base.env.backend, base.env.num_threads = self.backend, self.threads
         base.env.num_envs = self.num_envs or base.env.num_envs
         base.train_for(samples)
         distill = DISTILL_RECIPES[self.chosen](base)

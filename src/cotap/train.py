@@ -161,7 +161,7 @@ def _parse_base(args: list[str]) -> BaseOptions:
     if resumed:
         training = _resumed_config(resumed, "" if goes_on else recipe, "base", BaseTraining)
     else:
-        training = BASE_RECIPES[recipe or "default"]()
+        training = BASE_RECIPES[recipe or "default"](_peek(args, SHORTCUTS["--robot"]) or BaseTraining().env.robot)
     _unpin_library(args, training)
     samples = training.samples
     default = BaseOptions(recipe=recipe or "default", training=training)

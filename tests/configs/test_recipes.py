@@ -187,7 +187,7 @@ def every() -> dict[str, Any]:
     for base, make in BASE_RECIPES.items():
         out[base] = make()
         out |= {f"{base}, {name}": distil(make()) for name, distil in DISTILL_RECIPES.items()}
-    return out
+    return out | {f"{base}, g1": make("g1") for base, make in BASE_RECIPES.items()}
 
 
 @pytest.mark.parametrize("name", every())

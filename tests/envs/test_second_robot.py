@@ -23,8 +23,8 @@ NUM_ENVS, STEPS = 6, 4
 
 def training(robot: str = "made-up") -> BaseTraining:
     """The recipe that ships, pushes, loads and assistance included, on another robot and tiny."""
-    out = BASE_RECIPES["default"]()
-    out.env.robot, out.env.num_envs, out.env.num_threads = robot, NUM_ENVS, 1
+    out = BASE_RECIPES["default"](robot)
+    out.env.num_envs, out.env.num_threads = NUM_ENVS, 1
     out.ppo = dataclasses.replace(out.ppo, steps=STEPS, hidden=(16,), epochs=1, mini_batches=2)
     return out
 

@@ -82,7 +82,7 @@ def test_a_library_that_has_changed_is_refused_unless_it_is_given(library: Path,
 def test_training_takes_a_library_that_is_typed_as_it_now_is(library: Path, monkeypatch: pytest.MonkeyPatch):
     recipe = BASE_RECIPES["default"]()
     recipe.env.motions.clips.library_sha256 = "0" * 64
-    monkeypatch.setitem(BASE_RECIPES, "default", lambda: recipe)
+    monkeypatch.setitem(BASE_RECIPES, "default", lambda robot: recipe)  # noqa: ARG005
     assert _parse_base([]).training.env.motions.clips.library_sha256 == "0" * 64
     typed = _parse_base(["--env.motions.clips.library", str(library)]).training.env.motions.clips
     assert (typed.library, typed.library_sha256) == (str(library), "")

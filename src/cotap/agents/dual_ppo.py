@@ -61,7 +61,7 @@ class DualPPOConfig:
     """Weight of the value loss."""
     learning_rate: float = 1e-3
     """At the start; then adapted to `desired_kl`, per agent."""
-    desired_kl: float = 0.02
+    desired_kl: float = 0.01
     """Change of the policy per update that the learning rate aims at [nat]."""
     max_grad_norm: float = 1.0
     """Gradient norm above which gradients are scaled down, per network."""

@@ -61,12 +61,12 @@ class BaseTraining:
         self.runner.check()
 
 
-def default() -> BaseTraining:
+def default(robot: str = "h1") -> BaseTraining:
     """What ships: walks, stands, bears loads on the hands, and takes pushes; 300 M samples."""
-    return BaseTraining(
+    training = BaseTraining(
         env=HumanoidEnvConfig(
+            robot=robot,
             num_envs=1024,
-            actions=ActionConfig(waist_share=0.5),
             assist=AssistConfig(enabled=True),
             curriculum=CurriculumConfig(arm_motion_samples=3e6),
             forces=ExternalForceConfig(
@@ -76,24 +76,28 @@ def default() -> BaseTraining:
         ),
         runner=RunnerConfig(iterations=12_207),
     )
+    if robot == "g1":  # three joints in the waist, and two thirds of the weight under the same loads
+        training.env.actions.waist_share = 0.5
+        training.env.forces.hand_loads.episode_share = 0.2
+    return training
 
 
-def quick() -> BaseTraining:
+def quick(robot: str = "h1") -> BaseTraining:
     """Walking in the shortest time: no pushes, no loads; 30 M samples."""
-    training = default()
+    training = default(robot)
     training.env.forces = ExternalForceConfig()
     training.runner.iterations = 1220
     return training
 
 
-def paper() -> BaseTraining:
+def paper(robot: str = "h1") -> BaseTraining:
     """The paper's value for every setting that it names, and FALCON's for what it takes from there.
 
     Kept from `default` is what neither names: physics step, wrench of the first steps, most reward weights.
     """
     return BaseTraining(
         env=HumanoidEnvConfig(
-            num_envs=4096,
+            robot=robot, num_envs=4096,
             actions=ActionConfig(lower_scale=0.25, upper_scale=0.25, upper_mode="absolute"),
             observations=ObservationConfig(critic="history"),
             commands=CommandConfig(
@@ -117,9 +121,9 @@ def paper() -> BaseTraining:
     )  # fmt: skip
 
 
-def facet() -> BaseTraining:
+def facet(robot: str = "h1") -> BaseTraining:
     """FACET as the paper trains it: PD arms, its tracking reward on the data's own motion, no moving reference."""
-    training = default()
+    training = default(robot)
     track_as_facet(training.env.rewards.upper)
     return training
 
@@ -130,10 +134,10 @@ def track_as_facet(weights: UpperRewards) -> None:
     weights.track_key_points = weights.track_key_velocities = 0.0
 
 
-BASE_RECIPES: dict[str, Callable[[], BaseTraining]] = {
+BASE_RECIPES: dict[str, Callable[..., BaseTraining]] = {
     "default": default,
     "quick": quick,
     "paper": paper,
     "facet": facet,
 }
-"""Stage 1, by name."""
+"""Stage 1, by name; each takes the robot's name, by default the H1's."""
