@@ -19,6 +19,7 @@ from cotap.deployment.robot import Perturbations, Robot
 from cotap.envs import HumanoidEnvConfig
 from cotap.envs.punches import Punches
 from cotap.envs.terminations import diverged
+from cotap.evaluation.rollout import film_row
 from cotap.evaluation.tour.arm_walk import arms_at
 from cotap.evaluation.tour.protocol import CONTROL_S, PHYSICS_S, Tour
 from cotap.evaluation.tour.route import Pilot
@@ -115,7 +116,8 @@ def _run(
         way, turn = pilot.error(step // tour.segment_steps, *_pelvis(robot))
         torque = torch.from_numpy(robot.torque())[None]
         scorer.step(qpos[:, 2], qvel[:, 6:], torque, way, turn, diverged(qpos, qvel))
-        film.append(_picture(robot, controller))
+        hands_t = controller.arm_pose(controller.motion.current().position.double()).tip[0]
+        film.append(film_row(qpos[0], robot.truth(), hands_t, torch.zeros_like(hands_t)))
         if not scorer.standing.any():
             break
     return scorer.measures(), torch.stack(film)
@@ -132,15 +134,6 @@ def _ask(
 def _pelvis(robot: Robot) -> tuple[torch.Tensor, torch.Tensor]:
     """Where the base is: (1, 2) [m] and yaw (1,) [rad]."""
     return torch.tensor(robot.engine.qpos[None, :2]), yaw_of(robot.truth().base_rotation_w)
-
-
-def _picture(robot: Robot, controller: Controller) -> torch.Tensor:
-    """A row (nq + 6 H,) of a film, as `picture_row` has it."""
-    s = robot.truth()
-    points = controller.arm_pose(controller.motion.current().position.double()).tip[0]
-    points_w = points @ s.torso_rotation_w[0].T + s.torso_pos_w[0]
-    qpos = torch.tensor(robot.engine.qpos)
-    return torch.cat((qpos, points_w.flatten(), torch.zeros(points_w.numel()))).float()
 
 
 def _with_arm_gains(spec: RobotSpec, stance: TourStance) -> RobotSpec:

@@ -16,7 +16,7 @@ from cotap.deployment.safety import SafetyConfig, Watchdog
 from cotap.deployment.scenario import Scenario
 from cotap.envs.state import RobotState
 from cotap.envs.terminations import diverged, fallen
-from cotap.evaluation.rollout import Trajectory, arm_static_torque
+from cotap.evaluation.rollout import Trajectory, state_row
 
 Pilot = Callable[[Controller, float], bool]
 """Called at every control step with the time [s]: may change commands, and says whether to go on."""
@@ -119,32 +119,13 @@ def run_trial(
 def _row(
     robot: Robot, controller: Controller, s: RobotState, force_h: np.ndarray, fell: bool
 ) -> dict[str, torch.Tensor]:
-    asked = controller.commands
-    first = len(robot.spec.lower_joints)
     reference = controller.motion.current().position.double()
-    torque = torch.from_numpy(robot.torque()).unsqueeze(0)
-    offset_t = s.arms.tip - controller.arm_pose(reference).tip
-    force_w = torch.from_numpy(force_h).unsqueeze(0) @ s.heading_w.transpose(1, 2)
-    return {
-        "velocity": torch.cat((s.torso_linear_velocity_h[:, :2], s.yaw_rate.unsqueeze(1)), 1),
-        "command": asked.asked_velocity.clone(),
-        "stand": asked.asked_to_stand,
-        "height": s.height,
-        "height_command": asked.asked_height.clone(),
-        "position": s.torso_pos_w[:, :2],
-        "arm_error": s.joint_pos[:, first:] - reference,
-        "arm_velocity": s.joint_vel[:, first:],
-        "arm_torque": torque[:, first:],
-        "torque_share": torque.abs() / torch.from_numpy(robot.torque_limit),
-        "arm_static_torque": arm_static_torque(controller.upper_body.arms, s, force_w),
-        "hand_offset": offset_t @ s.torso_to_heading.transpose(1, 2),
-        "hand_error": offset_t.norm(dim=2),
-        "foot_contact": s.foot_contact,
-        "foot_speed": s.foot_velocity_w[:, :, :2].norm(dim=2),
-        "foot_height": s.foot_pos_w[:, :, 2],
-        "path_error": torch.full_like(s.height, math.nan),
-        "fell": torch.tensor([fell]),
-    }
+    return state_row(
+        s, controller.commands, reference, torch.from_numpy(robot.torque()).unsqueeze(0),
+        torch.from_numpy(robot.torque_limit), s.arms.tip - controller.arm_pose(reference).tip,
+        torch.from_numpy(force_h).unsqueeze(0) @ s.heading_w.transpose(1, 2), controller.upper_body.arms,
+        torch.full_like(s.height, math.nan), torch.tensor([fell]),
+    )  # fmt: skip
 
 
 def trajectory(trials: list[Trial], steps: int) -> Trajectory:

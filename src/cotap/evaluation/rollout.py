@@ -14,6 +14,7 @@ from cotap.checks import quoted, require_range
 from cotap.compliance.dynamics import gravity_torque
 from cotap.compliance.interface import Arms
 from cotap.envs import HumanoidEnv
+from cotap.envs.commands import CommandSource
 from cotap.envs.state import RobotState
 from cotap.memory import require_memory
 from cotap.rotations import rotate_inverse
@@ -113,9 +114,15 @@ def record_rollout(
 
 def picture_row(env: HumanoidEnv) -> torch.Tensor:
     """What a picture of the first env needs, a row (nq + 6 H,) of a film."""
-    s, hands = env.record.state, len(env.spec.arms)
-    points_w = env.record.key_points_reference_t[0, :hands] @ s.torso_rotation_w[0].T + s.torso_pos_w[0]
-    return torch.cat((env.sim.qpos[0].float(), points_w.flatten(), env.hand_force_w[0].flatten()))
+    hands_t = env.record.key_points_reference_t[0, : len(env.spec.arms)]
+    return film_row(env.sim.qpos[0], env.record.state, hands_t, env.hand_force_w[0])
+
+
+def film_row(qpos: torch.Tensor, s: RobotState, hands_t: torch.Tensor, force_w: torch.Tensor) -> torch.Tensor:
+    """A row (nq + 6 H,) of a film: first env of `s`, at `qpos` (nq,), its hands' references (H, 3), torso frame [m],
+    and the forces (H, 3) on its hands, world frame [N]."""
+    hands_w = hands_t @ s.torso_rotation_w[0].T + s.torso_pos_w[0]
+    return torch.cat((qpos, hands_w.flatten(), force_w.flatten())).float()
 
 
 def reference_actions(env: HumanoidEnv) -> torch.Tensor:
@@ -176,28 +183,51 @@ def arm_static_torque(arms: Arms, s: RobotState, force_w: torch.Tensor) -> torch
 
 def trajectory_row(env: HumanoidEnv, fell: torch.Tensor) -> dict[str, torch.Tensor]:
     """One step's row (N, ...) of a `Trajectory`, just after `env.step`; `fell` (N,) from its extras."""
-    r, upper = env.record, slice(env.num_lower, None)
-    s, hands = r.state, len(env.spec.arms)
-    offset_t = (r.key_points_t - r.key_points_reference_t)[:, :hands]
+    r = env.record
+    offset_t = (r.key_points_t - r.key_points_reference_t)[:, : len(env.spec.arms)]
+    path_error = (r.state.torso_pos_w[:, :2] - env.path.target_w).norm(dim=1)
+    return state_row(
+        r.state, env.commands, r.reference.position, r.torque, env.actuation.torque_limit, offset_t, env.hand_force_w,
+        env.upper_body.arms, torch.where(env.path.active, path_error, math.nan), fell,
+    )  # fmt: skip
+
+
+def state_row(
+    s: RobotState, commands: CommandSource, reference: torch.Tensor, torque: torch.Tensor, torque_limit: torch.Tensor,
+    offset_t: torch.Tensor, force_w: torch.Tensor, arms: Arms, path_error: torch.Tensor, fell: torch.Tensor,
+) -> dict[str, torch.Tensor]:  # fmt: skip
+    """A row (N, ...) of a `Trajectory`.
+
+    Args:
+        s: At the end of the step.
+        commands: What was asked for.
+        reference: (N, U) where the arms were to be [rad].
+        torque: (N, J) [Nm].
+        torque_limit: (J,) [Nm].
+        offset_t: (N, H, 3) hands relative to their reference, torso frame [m].
+        force_w: (N, H, 3) on the hands, world frame [N].
+        arms: What statics takes the arms for.
+        path_error: (N,) as a `Trajectory` has it [m].
+        fell: (N,) bool.
+    """
+    upper = slice(-reference.shape[1], None)
     return {
         "velocity": torch.cat((s.torso_linear_velocity_h[:, :2], s.yaw_rate.unsqueeze(1)), 1),
-        "command": env.commands.asked_velocity.clone(),
-        "stand": env.commands.asked_to_stand,
+        "command": commands.asked_velocity.clone(),
+        "stand": commands.asked_to_stand,
         "height": s.height,
-        "height_command": env.commands.asked_height.clone(),
+        "height_command": commands.asked_height.clone(),
         "position": s.torso_pos_w[:, :2],
-        "arm_error": s.joint_pos[:, upper] - r.reference.position,
+        "arm_error": s.joint_pos[:, upper] - reference,
         "arm_velocity": s.joint_vel[:, upper],
-        "arm_torque": r.torque[:, upper],
-        "torque_share": r.torque.abs() / env.actuation.torque_limit,
-        "arm_static_torque": arm_static_torque(env.upper_body.arms, s, env.hand_force_w),
+        "arm_torque": torque[:, upper],
+        "torque_share": torque.abs() / torque_limit,
+        "arm_static_torque": arm_static_torque(arms, s, force_w),
         "hand_offset": offset_t @ s.torso_to_heading.transpose(1, 2),
         "hand_error": offset_t.norm(dim=2),
         "foot_contact": s.foot_contact,
         "foot_speed": s.foot_velocity_w[:, :, :2].norm(dim=2),
         "foot_height": s.foot_pos_w[:, :, 2],
-        "path_error": torch.where(
-            env.path.active, (s.torso_pos_w[:, :2] - env.path.target_w).norm(dim=1), torch.full_like(s.height, math.nan)
-        ),
+        "path_error": path_error,
         "fell": fell,
     }
