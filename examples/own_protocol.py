@@ -13,7 +13,7 @@ import torch
 
 from cotap.envs import HumanoidEnv
 from cotap.evaluate import PROTOCOLS, main
-from cotap.evaluation.metrics import masked_mean, summaries
+from cotap.evaluation.metrics import masked_mean, outcome
 from cotap.evaluation.protocol import RolloutProtocol
 from cotap.evaluation.report import save_figure
 from cotap.evaluation.rollout import Trajectory
@@ -41,7 +41,7 @@ class Turning(RolloutProtocol):
         late = alive & (torch.arange(len(alive)) * env.dt > 2.0).unsqueeze(1)  # it turns as fast as it will
         away = (trajectory.position - trajectory.position[0]).norm(dim=2)
         measures = {"turned": masked_mean(trajectory.velocity[..., 2], late), "strayed": (away * alive).amax(0)}
-        return {"metrics": summaries(measures, alive[0], self.seed)}
+        return outcome(measures, alive[-1], self.seed, self.per_env)
 
     def plot(self, path: Path, result: dict[str, Any]) -> None:  # noqa: ARG002
         figure, axes = plt.subplots()

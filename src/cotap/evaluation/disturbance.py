@@ -14,7 +14,7 @@ from cotap.checks import require_range
 from cotap.compliance.laws import WITHOUT_STIFFNESS
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.scripted_forces import ForceProfile
-from cotap.evaluation.metrics import masked_mean, summaries
+from cotap.evaluation.metrics import masked_mean, outcome, summarize
 from cotap.evaluation.report import pyplot, save_figure
 from cotap.evaluation.rollout import Trajectory
 from cotap.evaluation.scenario import Scenario
@@ -55,8 +55,6 @@ class Impact(Scenario):
     """Falls count for this long from the onset [s]."""
     episode_seconds: float = 4.0
     """Length of the evaluation [s]."""
-    per_env: bool = False
-    """Write the figures of every env as well. `cotap compare` then compares env by env."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
@@ -107,7 +105,6 @@ class Impact(Scenario):
         onset, measured = round(self.onset / t.dt), self.measured_steps(t.dt)
         begin, end = measured.start, measured.stop
         stood = ~t.fell.any(0)
-        everyone = torch.ones_like(stood)
         window = window_measures(t, begin, end, hit)
         if any(self.force):
             window |= response_measures(t, onset, begin, end, hit)
@@ -124,11 +121,9 @@ class Impact(Scenario):
         window |= self.watch.measures(t.alive()[begin:end], hit)
         return {
             "falls": falls_by_time(t, onset, fall_end),
-            "metrics": summaries(window, everyone, self.seed),
-            "metrics_without_falls": summaries(window, stood, self.seed),
+            **outcome(window, stood, self.seed, self.per_env),
             "window": {"start": self.onset + self.window[0], "end": self.onset + self.window[1]},
             "curve": curve(t, onset, hit),
-            **({"per_env": per_env_figures(window, stood)} if self.per_env else {}),
         } | self._stiffness(env, window, stood)
 
     def _without_load(self) -> str:
@@ -155,7 +150,7 @@ class Impact(Scenario):
             return {"effective_stiffness": {"commanded": commanded, "measured": None, "reason": reason}}
         measured: list[float | None] = []
         for force, axis in zip(self.force, "xyz", strict=True):
-            moved = summaries({"d": measures[f"displacement_{axis}"]}, stood, self.seed)["d"]
+            moved = summarize(measures[f"displacement_{axis}"][stood], self.seed)
             low, high = moved["ci95"] or (0.0, 0.0)
             measured.append(force / float(moved["mean"] or 0.0) if force != 0.0 and low * high > 0.0 else None)
         out = {"commanded": commanded, "measured": measured}
@@ -228,18 +223,6 @@ def window_measures(t: Trajectory, begin: int, end: int, hit: list[int]) -> dict
         "joints_near_limit": masked_mean((part.torque_share > NEAR_LIMIT).float().mean(2), alive),
         "energy": torch.where(seen, energy, nothing),
         "fall_fraction": t.fell[:end].any(0),
-    }
-
-
-def per_env_figures(measures: dict[str, torch.Tensor], stood: torch.Tensor) -> dict[str, list[float | None]]:
-    """Measures (N,) env by env, to six digits, null where an env has none; and whether it `stood` to the end."""
-
-    def plain(value: float) -> float | None:
-        return float(f"{value:.6g}") if math.isfinite(value) else None
-
-    return {
-        "stood": [float(s) for s in stood.tolist()],
-        **{name: [plain(v) for v in values.double().tolist()] for name, values in measures.items()},
     }
 
 

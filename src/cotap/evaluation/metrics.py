@@ -198,6 +198,30 @@ def summaries(measures: dict[str, torch.Tensor], keep: torch.Tensor, seed: int) 
     return {name: summarize(values[keep], seed) for name, values in measures.items()}
 
 
+def outcome(measures: dict[str, torch.Tensor], stood: torch.Tensor, seed: int, per_env: bool) -> dict[str, Any]:
+    """What the JSON says of measures, (N,) or (N, K): summed up over all envs and over those that `stood` (N,) to the
+    end, and, with `per_env`, env by env."""
+    return {
+        "metrics": summaries(measures, torch.ones_like(stood), seed),
+        "metrics_without_falls": summaries(measures, stood, seed),
+        **({"per_env": per_env_figures(measures, stood)} if per_env else {}),
+    }
+
+
+def per_env_figures(measures: dict[str, torch.Tensor], stood: torch.Tensor) -> dict[str, list[float | None]]:
+    """Measures (N,) env by env, to six digits, null where an env has none; and whether it `stood` to the end. Measures
+    (N, K) are left out."""
+
+    def plain(value: float) -> float | None:
+        return float(f"{value:.6g}") if math.isfinite(value) else None
+
+    single = {name: values for name, values in measures.items() if values.dim() == 1}
+    return {
+        "stood": [float(s) for s in stood.tolist()],
+        **{name: [plain(v) for v in values.double().tolist()] for name, values in single.items()},
+    }
+
+
 def wilson_interval(share: float, n: int) -> tuple[float, float]:
     """95 % interval of a share that was seen in `n` trials (Wilson 1927)."""
     z = 1.959964

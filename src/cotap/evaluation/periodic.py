@@ -12,9 +12,9 @@ import torch
 from cotap.checks import require_finite, require_range
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.scripted_forces import ForceProfile
-from cotap.evaluation.disturbance import falls_by_time, per_env_figures, window_measures
+from cotap.evaluation.disturbance import falls_by_time, window_measures
 from cotap.evaluation.law_options import LawOptions
-from cotap.evaluation.metrics import summaries
+from cotap.evaluation.metrics import outcome
 from cotap.evaluation.report import pyplot, save_figure
 from cotap.evaluation.rollout import Trajectory
 from cotap.evaluation.scenario import Scenario
@@ -40,8 +40,6 @@ class PeriodicLoad(Scenario):
     """Number of periods. All but the first are measured."""
     onset: float = 1.0
     """When the load begins [s]."""
-    per_env: bool = False
-    """Write the figures of every env as well. `cotap compare` then compares env by env."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
@@ -81,14 +79,11 @@ class PeriodicLoad(Scenario):
         measures = window_measures(t, begin, end, hit) | swing_measures(t, begin, end, self.period, elbows, sides)
         for i, side in enumerate(sides):
             measures |= self.watch.measures(t.alive()[begin:end], [i], f"_{side}")
-        stood = ~t.fell.any(0)
         return {
             "falls": falls_by_time(t, round(self.onset / t.dt), end),
-            "metrics": summaries(measures, torch.ones_like(stood), self.seed),
-            "metrics_without_falls": summaries(measures, stood, self.seed),
+            **outcome(measures, ~t.fell.any(0), self.seed, self.per_env),
             "window": {"start": self.onset + self.period, "end": self.seconds},
             "curve": swing_curve(t, round(self.onset / t.dt), elbows, sides),
-            **({"per_env": per_env_figures(measures, stood)} if self.per_env else {}),
         }
 
     def plot(self, path: Path, result: dict[str, Any]) -> None:

@@ -108,6 +108,8 @@ class RolloutProtocol(Protocol):
     upper_actions: str = "policy"
     """What moves the arms: policy or reference. reference leaves out the policy's own arm actions; a number from 0 to 1
     is the share of them that is left."""
+    per_env: bool = False
+    """Write the figures of every env as well. `cotap compare` then compares env by env."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""

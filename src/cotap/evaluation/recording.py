@@ -13,7 +13,7 @@ import torch
 
 from cotap.checks import quoted, reason_of, require_finite, require_range
 from cotap.evaluation.disturbance import response_measures, window_measures
-from cotap.evaluation.metrics import summarize, tracking_measures
+from cotap.evaluation.metrics import outcome, tracking_measures
 from cotap.evaluation.rollout import STEPPED, Trajectory
 from cotap.files import write_arrays
 from cotap.inputs import InputError, read_arrays
@@ -224,8 +224,7 @@ def measure(recording: Recording, protocol: RecordingProtocol) -> dict[str, Any]
     return {
         "num_envs": count,
         "num_falls": int((~stood).sum()),
-        "metrics": {name: summarize(value) for name, value in measures.items()},
-        "metrics_without_falls": {name: summarize(value[stood]) for name, value in measures.items()},
+        **outcome(measures, stood, seed=0, per_env=False),
         "robots": [
             {name: None if math.isnan(value[i]) else float(value[i]) for name, value in measures.items()}
             for i in range(count)

@@ -13,9 +13,8 @@ from cotap.checks import require_range
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.arm_task import TASK_WEIGHTS, task_forces
 from cotap.envs.rewards import UpperRewards
-from cotap.evaluation.disturbance import per_env_figures
 from cotap.evaluation.law_options import LawOptions
-from cotap.evaluation.metrics import masked_mean, summaries
+from cotap.evaluation.metrics import masked_mean, outcome
 from cotap.evaluation.protocol import RolloutProtocol
 from cotap.evaluation.report import pyplot, save_figure
 from cotap.evaluation.rollout import Trajectory
@@ -32,8 +31,6 @@ class Task(RolloutProtocol):
 
     episode_seconds: float = 20.0
     """Length of the evaluation [s]."""
-    per_env: bool = False
-    """Write every env's figures as well: `cotap compare` then compares env by env."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
@@ -66,13 +63,11 @@ class Task(RolloutProtocol):
     def measure(self, trajectory: Trajectory, env: HumanoidEnv) -> dict[str, Any]:
         """The measured part of the evaluation's JSON, falls aside."""
         figures = torch.stack([*self._steps, step_figures(env)]).cpu()
-        measures = task_measures(figures, trajectory.alive()) | {"fall_fraction": trajectory.fell.any(0)}
-        stood = ~trajectory.fell.any(0)
+        fell = trajectory.fell.any(0)
+        measures = task_measures(figures, trajectory.alive()) | {"fall_fraction": fell}
         return {
-            "metrics": summaries(measures, torch.ones_like(stood), self.seed),
-            "metrics_without_falls": summaries(measures, stood, self.seed),
+            **outcome(measures, ~fell, self.seed, self.per_env),
             "window": {"start": 0.0, "end": self.seconds},
-            **({"per_env": per_env_figures(measures, stood)} if self.per_env else {}),
         }
 
     def plot(self, path: Path, result: dict[str, Any]) -> None:

@@ -6,13 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from cotap.checks import require_one_of, require_range
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.hand_loads import HandLoadConfig
-from cotap.evaluation.disturbance import per_env_figures
-from cotap.evaluation.metrics import summaries, tracking_measures, tracking_slopes
+from cotap.evaluation.metrics import outcome, tracking_measures, tracking_slopes
 from cotap.evaluation.protocol import RolloutProtocol
 from cotap.evaluation.report import plot_tracking
 from cotap.evaluation.rollout import Trajectory
@@ -46,8 +43,6 @@ class VelocityTracking(RolloutProtocol):
     collision: str = ""
     """What collides: feet (with the floor) or full (all shapes). By default as in the training. With full, shapes also
     meet each other."""
-    per_env: bool = False
-    """Write the figures of every env as well. `cotap compare` then compares env by env."""
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
@@ -87,19 +82,14 @@ class VelocityTracking(RolloutProtocol):
         """The measured part of the evaluation's JSON, falls aside."""
         period = env.cfg.gait.period_s
         measures = tracking_measures(trajectory, period, self.settle_seconds)
-        stood = ~trajectory.fell.any(0)
-        metrics = summaries(measures, torch.ones_like(stood), self.seed)
+        found = outcome(measures, ~trajectory.fell.any(0), self.seed, self.per_env)
         slopes = tracking_slopes(trajectory, period, self.settle_seconds, self.seed)
         return {
-            "e_lin": metrics["e_lin"]["mean"],
-            "e_yaw": metrics["e_yaw"]["mean"],
-            "episode_length_fraction": metrics["episode_length_fraction"]["mean"],
+            **{name: found["metrics"][name]["mean"] for name in ("e_lin", "e_yaw", "episode_length_fraction")},
             "slopes": {name: slope["mean"] for name, slope in slopes.items()},
             "slopes_ci95": {name: slope["ci95"] for name, slope in slopes.items()},
-            "metrics": metrics,
-            "metrics_without_falls": summaries(measures, stood, self.seed),
+            **found,
             "window": {"start": 0.0, "end": self.episode_seconds},
-            **({"per_env": per_env_figures(measures, stood)} if self.per_env else {}),
         }
 
     def plot(self, path: Path, result: dict[str, Any]) -> None:

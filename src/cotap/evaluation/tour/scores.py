@@ -8,8 +8,7 @@ from typing import Any
 
 import torch
 
-from cotap.evaluation.disturbance import per_env_figures
-from cotap.evaluation.metrics import summaries, summarize
+from cotap.evaluation.metrics import outcome, summarize
 
 
 @dataclass(frozen=True)
@@ -50,7 +49,6 @@ class TourMeasures:
             "energy": torch.where(self.completed, self.energy, nothing),
             "vibration": torch.where(self.completed, self.vibration, nothing),
         }
-        of_runs = {name: values for name, values in measures.items() if values.dim() == 1}
         ends = [
             {"end_s": segment_s * (k + 1)}
             | {name: summarize(getattr(self, name)[:, k], seed) for name in ("position_error", "yaw_error")}
@@ -58,12 +56,10 @@ class TourMeasures:
         ]
         return {
             "num_falls": int((~self.completed).sum()),
-            "metrics": summaries(measures, torch.ones_like(self.completed), seed),
-            "metrics_without_falls": summaries(measures, self.completed, seed),
+            **outcome(measures, self.completed, seed, per_env),
             "window": {"start": 0.0, "end": segment_s * len(ends)},
             "segments": ends,
             "curve": {"time": time.tolist(), "upright": upright.float().mean(1).tolist()},
-            **({"per_env": per_env_figures(of_runs, self.completed)} if per_env else {}),
         }
 
 
