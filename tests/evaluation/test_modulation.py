@@ -85,7 +85,7 @@ def test_a_stores_measures_by_hand():
 
 def test_a_small_store_makes_arms_wait_and_the_plot_shows_it(tmp_path):
     protocol = Modulation(num_envs=4, pelvis="fixed", force=(0.0, 0.0, -20.0), hand="both", onset=0.5,
-                          window=(0.0, 0.8), fall_seconds=0.8, episode_seconds=1.3)  # fmt: skip
+                          window=(0.0, 0.8), fall_seconds=0.8, episode_seconds=1.3, per_env=True)  # fmt: skip
     delays = []
     for store in (0.05, 50.0):
         cfg = protocol.configure(HumanoidEnvConfig(num_threads=1))
@@ -98,7 +98,11 @@ def test_a_small_store_makes_arms_wait_and_the_plot_shows_it(tmp_path):
         result = protocol.measure(t, env)
         assert result["metrics"]["stiffening_delay_s"]["n"] == 2  # the envs with steps
         assert result["metrics"]["store_energy"]["n"] == 4
+        assert result["per_env"].keys() == result["metrics"].keys() | {"stood"}
+        of_envs = result["per_env"]["stiffening_delay_s"]
+        assert [delay is None for delay in of_envs] == [False, True, False, True]
         delays.append(result["metrics"]["stiffening_delay_s"]["mean"])
+        assert delays[-1] == pytest.approx((of_envs[0] + of_envs[2]) / 2.0, rel=1e-5)
         assert len(result["reaching"]["time"]) <= 25
     assert delays[0] > delays[1] + 0.1
     assert delays[1] == 0.0

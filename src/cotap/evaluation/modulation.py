@@ -14,7 +14,7 @@ from cotap.compliance.laws import WITHOUT_STIFFNESS, reads
 from cotap.envs import HumanoidEnv
 from cotap.evaluation.disturbance import ConstantLoad, window_measures
 from cotap.evaluation.law_options import LawOptions
-from cotap.evaluation.metrics import summaries
+from cotap.evaluation.metrics import outcome, summaries
 from cotap.evaluation.report import pyplot, save_figure
 from cotap.evaluation.rollout import Trajectory
 from cotap.evaluation.stores import StoreRecord, curve
@@ -95,9 +95,9 @@ class Modulation(ConstantLoad):
             "effective_stiffness": {"commanded": None, "measured": None, "reason": "stiffness changes all the time"}
         }
         # Nor is there one stiffness to err from, or a rest to overshoot.
-        for measures in (result["metrics"], result["metrics_without_falls"]):
+        for part in ("metrics", "metrics_without_falls", "per_env"):
             for name in ("impedance_error", "load_overshoot"):
-                measures.pop(name, None)
+                result.get(part, {}).pop(name, None)
         steps = torch.full((env.num_envs,), self.change == "step")
         if self.change == "both":
             steps = torch.arange(env.num_envs) % 2 == 0
@@ -122,9 +122,8 @@ class Modulation(ConstantLoad):
         counted = trajectory.alive()
         counted[:begin], counted[end:] = False, False
         found, more = store_measures(self.stores, changed, counted, dt)
-        stood = ~trajectory.fell.any(0)
-        for name, keep in (("metrics", torch.ones_like(stood)), ("metrics_without_falls", stood)):
-            result[name] |= summaries(found, keep, self.seed)
+        for part, figures in outcome(found, ~trajectory.fell.any(0), self.seed, self.per_env).items():
+            result[part] |= figures
         result["reaching"] = curve(self.stores, changed, more, dt, self.period / 2.0, self.seed)
 
     def plot(self, path: Path, result: dict[str, Any]) -> None:
