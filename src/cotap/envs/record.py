@@ -10,6 +10,7 @@ from cotap.envs.gait_phase import desired_contact, swing_progress
 from cotap.envs.rewards import StepRecord
 from cotap.envs.scales import RobotScales
 from cotap.envs.state import RobotState, StateReader
+from cotap.motions.elbow import elbow_index
 from cotap.motions.generator import ArmReference
 from cotap.persistence import Stateful
 from cotap.robots import RobotSpec
@@ -31,10 +32,7 @@ class Recorder(Stateful):
     def __init__(self, spec: RobotSpec, reader: StateReader, num_envs: int, dt: float, gait_period_s: float) -> None:
         self._scales, self._reader = RobotScales.of(spec), reader
         self._num_feet, self._num_arms = len(spec.feet), len(spec.arms)
-        chains = [spec.chain(arm.hand_body, spec.torso_body) for arm in spec.arms]
-        self._elbows = [
-            [link.name for link in chain].index(arm.elbow_body) for chain, arm in zip(chains, spec.arms, strict=True)
-        ]
+        self._elbows = [elbow_index(spec, arm) for arm in spec.arms]
         self._errors = torch.zeros(num_envs, max(1, round(gait_period_s / dt)), 3)  # of each step, the newest last
 
     @property

@@ -18,6 +18,7 @@ from cotap.evaluation.metrics import outcome
 from cotap.evaluation.report import pyplot, save_figure
 from cotap.evaluation.rollout import Trajectory
 from cotap.evaluation.scenario import Scenario
+from cotap.motions.elbow import elbow_index
 from cotap.robots import RobotSpec
 
 
@@ -111,8 +112,7 @@ class PeriodicLoad(Scenario):
 
 def elbow_joints(spec: RobotSpec) -> list[int]:
     """Each arm's elbow among the arm joints (U)."""
-    joints = [spec.body(arm.elbow_body).joint or "" for arm in spec.arms]
-    return [spec.upper_joints.index(joint) for joint in joints]
+    return [i * len(arm.joints) + elbow_index(spec, arm) for i, arm in enumerate(spec.arms)]
 
 
 def swing_measures(
