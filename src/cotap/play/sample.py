@@ -24,8 +24,8 @@ def take_sample(env: HumanoidEnv, fell: torch.Tensor, laws: list[list[str]], for
         laws: [N][H] names of the arms' laws.
         force_h: (N, H, 3) what pulled on the hands [N].
     """
-    state, reference = env.record.state, env.record.reference.position
-    points_w, reference_w = _hands_w(env, reference)
+    state = env.record.state
+    reference_t = env.record.key_points_reference_t[:, : len(env.spec.arms)]
     jacobian_h = state.torso_to_heading.unsqueeze(1) @ env.reader.arm_chains.jacobian(state.arms)
     stiffness = env.arm_stiffness()
     none = [[law in WITHOUT_STIFFNESS for law in row] for row in laws]
@@ -33,8 +33,8 @@ def take_sample(env: HumanoidEnv, fell: torch.Tensor, laws: list[list[str]], for
     eigenvalues = torch.linalg.eigvalsh(stiffness)
     scene = {
         "qpos": env.sim.qpos.clone(),
-        "hand_w": points_w,
-        "hand_reference_w": reference_w,
+        "hand_w": state.hand_pos_w,
+        "hand_reference_w": state.torso_pos_w.unsqueeze(1) + reference_t @ state.torso_rotation_w.transpose(1, 2),
         "hand_force_w": (state.heading_w.unsqueeze(1) @ force_h.unsqueeze(-1)).squeeze(-1),
         "heading_w": state.heading_w,
         "commanded_stiffness": commanded,
@@ -58,10 +58,3 @@ def effective_stiffness(jacobian: torch.Tensor, joint_stiffness: torch.Tensor) -
     # A straight arm does not give along itself at all; a micrometre per newton stands for that.
     rigid = 1e-6 * torch.eye(3, dtype=torch.float64)
     return torch.linalg.inv(compliance + rigid).float()
-
-
-def _hands_w(env: HumanoidEnv, reference: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Hands and their references (N, H, 3), world frame; the reference is carried in the torso frame."""
-    s = env.record.state
-    wanted = env.reader.arm_chains.pose(reference.unflatten(1, (len(env.spec.arms), -1))).tip
-    return s.hand_pos_w, s.torso_pos_w.unsqueeze(1) + wanted @ s.torso_rotation_w.transpose(1, 2)
