@@ -9,7 +9,7 @@ import torch
 
 from cotap.checks import require_one_of, require_range
 from cotap.compliance.admittance import AdmittanceLaw, StaticShift, VirtualMass
-from cotap.compliance.arguments import full_precision
+from cotap.compliance.arguments import full_precision, symmetric_part
 from cotap.compliance.dynamics import critical_damping, gravity_torque, joint_inertia
 from cotap.compliance.fast import ArmStiffness, blended_stiffness, inverse_3x3
 from cotap.compliance.impedance import BlendedTorqueLaw
@@ -197,8 +197,7 @@ def _arm_stiffness(
     if base_compliance_h is None:
         return stiffness, torch.zeros_like(stiffness[..., 0], dtype=torch.bool)
     compliance, projected = project_compliance(torch.diag_embed(1.0 / stiffness) - base_compliance_h, LEAST_COMPLIANCE)
-    inverse = inverse_3x3(compliance)
-    return 0.5 * (inverse + inverse.transpose(-1, -2)), projected
+    return symmetric_part(inverse_3x3(compliance)), projected
 
 
 def _cotap(arms: Arms, cfg: LawConfig) -> UpperBodyLaw:

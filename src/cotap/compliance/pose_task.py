@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import torch
 
+from cotap.compliance.arguments import symmetric_part
 from cotap.compliance.fast import ArmStiffness
 from cotap.compliance.kinematics import ChainPose, SerialChains
 from cotap.compliance.stiffness import damped_gram_inverse
@@ -55,7 +56,7 @@ def blended_pose_stiffness(
     task[..., :3, :3] = stiffness if stiffness.dim() == j.dim() else torch.diag_embed(stiffness)
     task[..., 3:, 3:] = rotational_stiffness / characteristic_length**2 * torch.eye(3, dtype=j.dtype, device=j.device)
     compliant = j.transpose(-1, -2) @ task @ j + null * null_projector
-    values, vectors = torch.linalg.eigh(0.5 * (compliant + compliant.transpose(-1, -2)))
+    values, vectors = torch.linalg.eigh(symmetric_part(compliant))
     blended = largest.pow(1.0 - ratio).unsqueeze(-1) * values.clamp_min(1e-9).pow(ratio.unsqueeze(-1))
     rows, columns = root.unsqueeze(-1), root.unsqueeze(-2)
     whole = rows * ((vectors * blended.unsqueeze(-2)) @ vectors.transpose(-1, -2)) * columns

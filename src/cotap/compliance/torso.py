@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import torch
 
-from cotap.compliance.arguments import full_precision
+from cotap.compliance.arguments import full_precision, symmetric_part
 
 
 @full_precision
@@ -36,8 +36,7 @@ def parallel(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     # Directions that neither yields in stay rigid.
     size = torch.diagonal(total, dim1=-2, dim2=-1).mean(-1)[..., None, None]
     inverse = torch.linalg.pinv(total / size, rtol=1e-6, hermitian=True) / size
-    both = a @ inverse @ b
-    return 0.5 * (both + both.transpose(-1, -2))
+    return symmetric_part(a @ inverse @ b)
 
 
 def torso_compliance(legs: torch.Tensor, waist: torch.Tensor, contact: torch.Tensor) -> torch.Tensor:
