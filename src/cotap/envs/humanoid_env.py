@@ -228,7 +228,7 @@ class HumanoidEnv(VecEnv):
             self.commands.set_velocity(velocity, yaw_rate, self.path.active)
         if self.upper_body.active:
             self.upper_body.sense(s, self.hand_force_w, self.actuation.arm_effort)
-        self.upper_body.step(self.dt, self.rng)
+        self.upper_body.step(self.rng)
         self.forces.step(self.curriculum.samples, self.rng)
 
     def _reward(self, bad: torch.Tensor, time_out: torch.Tensor) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:

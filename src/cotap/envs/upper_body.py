@@ -194,10 +194,10 @@ class UpperBody(Stateful):
         if self._cfg.sampling.enabled:
             self._sample(mask, rng)
 
-    def step(self, dt: float, rng: torch.Generator) -> None:
+    def step(self, rng: torch.Generator) -> None:
         """Advance the clock of the parameters by one control step."""
         if self._cfg.sampling.enabled:
-            self._hold_s = self._hold_s - dt
+            self._hold_s = self._hold_s - self._dt
             self._sample(self._hold_s <= 0.0, rng)
 
     def modulate(self, action: torch.Tensor) -> None:
