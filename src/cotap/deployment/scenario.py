@@ -81,9 +81,8 @@ class ArmMotion:
             raise ValueError("arms: give a pose or a clip, not both")
         if self.pose:
             _require_length("arms.pose", self.pose, len(spec.upper_joints))
-        for i, (value, name) in enumerate(zip(self.pose, spec.upper_joints, strict=False)):
-            joint = spec.joints[spec.indices([name])[0]]
-            require_range(f"arms.pose[{i}] ({name})", value, *joint.range_rad)
+        for i, (value, joint) in enumerate(zip(self.pose, spec.upper_joint_specs, strict=False)):
+            require_range(f"arms.pose[{i}] ({joint.name})", value, *joint.range_rad)
         for name in ("clip", "library"):
             if not isinstance(getattr(self, name), str):
                 raise ValueError(f"arms.{name} must be a name, got {quoted(getattr(self, name))}")

@@ -19,7 +19,7 @@ def about_terms(cfg: HumanoidEnvConfig, spec: RobotSpec, terms: tuple[Term, ...]
     A range is (low, high), each one number or one for every joint: that of training for commands, what can be for the
     rest, null where there is no bound.
     """
-    joints, arms, c = spec.joints, spec.joints[len(spec.lower_joints) :], cfg.commands
+    joints, arms, c = spec.joints, spec.upper_joint_specs, cfg.commands
     low, high = ([j.range_rad[i] for j in arms] for i in (0, 1))
     limits = [cfg.torque_limit_scale * j.torque_limit_nm for j in arms]
     speeds = [j.velocity_limit_rad_s for j in joints]

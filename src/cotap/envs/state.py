@@ -121,8 +121,7 @@ class StateReader:
         self._source, self._dtype = source, dtype
         self.arm_chains = arm_chains(spec, dtype)
         self._waist = chains_between(spec, spec.base_body, [(spec.torso_body, (0.0, 0.0, 0.0))], dtype)
-        waist = [b.joint or "" for b in spec.chain(spec.torso_body, spec.base_body)]
-        self._waist_ids = spec.indices(waist)
+        self._waist_ids = spec.indices(spec.waist_joints)
         self._arm_ids = torch.tensor(spec.indices(spec.upper_joints))
         self._num_arms = len(spec.arms)
         names = [f"{foot.side}_foot" for foot in spec.feet]

@@ -368,10 +368,9 @@ class _TorsoModel:
         self._legs = chains_between(spec, spec.base_body, [(f.body, f.sole) for f in spec.feet], dtype)
         self._leg_joints = torch.tensor([spec.indices(chain) for chain in names])
         self._leg_gains = torch.tensor([[gains[n] for n in chain] for chain in names], dtype=dtype)
-        waist = [b.joint or "" for b in spec.chain(spec.torso_body, spec.base_body)]
         self._waist = chains_between(spec, spec.base_body, [(spec.torso_body, (0.0, 0.0, 0.0))], dtype)
-        self._waist_joints = torch.tensor([spec.indices(waist)])
-        self._waist_gains = torch.tensor([[gains[n] for n in waist]], dtype=dtype)
+        self._waist_joints = torch.tensor([spec.indices(spec.waist_joints)])
+        self._waist_gains = torch.tensor([[gains[n] for n in spec.waist_joints]], dtype=dtype)
 
     def hand_compliance(self, s: RobotState, to_heading: torch.Tensor) -> torch.Tensor | None:
         """(N, A, 3, 3) [m/N], or None where stiffness is against the torso."""

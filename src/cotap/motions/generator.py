@@ -75,7 +75,7 @@ class MotionGenerator(Stateful):
     def __init__(self, cfg: MotionConfig, spec: RobotSpec, num_envs: int, dt: float) -> None:
         cfg.check()
         self.cfg, self._dt = cfg, dt
-        joints = [spec.joints[i] for i in spec.indices(spec.upper_joints)]
+        joints = spec.upper_joint_specs
         default = torch.tensor([j.default_rad for j in joints])
         low, high = torch.tensor([j.range_rad for j in joints]).unbind(1)
         self.default = default

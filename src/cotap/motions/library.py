@@ -64,7 +64,7 @@ def check_clip(clip: MotionClip, spec: RobotSpec) -> None:
         raise MotionError(
             f"clip {quoted(clip.name)} must have a name of at most {_LONGEST_NAME} characters, all of them printable"
         )
-    upper = [spec.joints[i] for i in spec.indices(spec.upper_joints)]
+    upper = spec.upper_joint_specs
     if clip.arms.ndim != 2 or clip.arms.shape[1] != len(upper):
         raise MotionError(f"clip {clip.name!r}: arms must have shape (T, {len(upper)}), got {clip.arms.shape}")
     if clip.root.shape != (len(clip.arms), 3):

@@ -52,7 +52,7 @@ def make_clip(spec: RobotSpec, motion: JointMotion, source: str, licence: str) -
             finite or beyond all that a robot does, or a clip that `check_clip` refuses.
     """
     _check(spec, motion)
-    upper = [spec.joints[i] for i in spec.indices(spec.upper_joints)]
+    upper = spec.upper_joint_specs
     low, high = np.array([j.range_rad for j in upper]).T
     speed = np.array([j.velocity_limit_rad_s for j in upper])
     arms = resample(motion.times_s, motion.arms)
@@ -128,8 +128,7 @@ def limit_speed(values: np.ndarray, largest_step: np.ndarray) -> np.ndarray:
 
 def mirror_clip(spec: RobotSpec, clip: MotionClip) -> MotionClip:
     """The left-right mirror image of a clip."""
-    by_name = {j.name: j for j in spec.joints}
-    joints = [by_name[n] for n in spec.upper_joints]
+    joints = spec.upper_joint_specs
     index = [spec.upper_joints.index(j.mirror_name) for j in joints]
     arms = clip.arms[:, index] * np.array([j.mirror_sign for j in joints], dtype=np.float32)
     root = clip.root * np.array([1.0, -1.0, -1.0], dtype=np.float32)

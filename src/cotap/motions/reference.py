@@ -104,7 +104,7 @@ def load_clips(cfg: ClipConfig, spec: RobotSpec) -> MotionLibrary:
     names = list(cfg.only) or [name for name in library.names() if name not in cfg.held_out]
     if not names:
         raise MotionError("clips.held_out leaves no clip to play")
-    limit = np.array([spec.joints[i].velocity_limit_rad_s for i in spec.indices(spec.upper_joints)])
+    limit = np.array([j.velocity_limit_rad_s for j in spec.upper_joint_specs])
     clips = [pace(clip, cfg.velocity_share * limit, cfg.acceleration) for clip in library.select(names, spec).clips]
     return MotionLibrary(clips, spec)
 
@@ -123,7 +123,7 @@ class ReferenceMotion(Stateful):
         self.cfg, self._dt = cfg.clips, dt
         self.generator = MotionGenerator(cfg.generator, spec, num_envs, dt)
         self.default = self.generator.default
-        joints = [spec.joints[i] for i in spec.indices(spec.upper_joints)]
+        joints = spec.upper_joint_specs
         low, high = torch.tensor([j.range_rad for j in joints]).unbind(1)
         margin = cfg.generator.limit_margin_rad
         self._low, self._high = low + margin, high - margin

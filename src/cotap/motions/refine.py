@@ -26,7 +26,7 @@ _MARGIN = 0.97
 
 def slow_down(spec: RobotSpec, arms: np.ndarray) -> np.ndarray:
     """Joints (T, U) near `arms` (T, U), both at 50 Hz, within position limits and nearly within velocity limits."""
-    joints = [spec.joints[i] for i in spec.indices(spec.upper_joints)]
+    joints = spec.upper_joint_specs
     low, high = torch.tensor([j.range_rad for j in joints], dtype=torch.float32).unbind(1)
     largest = _MARGIN / FPS * torch.tensor([j.velocity_limit_rad_s for j in joints], dtype=torch.float32)
     chains = arm_chains(spec)

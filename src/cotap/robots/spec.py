@@ -127,6 +127,11 @@ class RobotSpec:
         return tuple(name for arm in self.arms for name in arm.joints)
 
     @cached_property
+    def upper_joint_specs(self) -> tuple[JointSpec, ...]:
+        """The same, described."""
+        return self.joints[len(self.lower_joints) :]
+
+    @cached_property
     def lower_joints(self) -> tuple[str, ...]:
         """Every other joint: legs and waist."""
         return tuple(n for n in self.joint_names if n not in self.upper_joints)

@@ -33,7 +33,7 @@ class ArmWalk:
         self._start = stance.angles[spec.indices(spec.arms[0].joints)].double()
         self._chains, self._arms = arm_chains(spec, torch.float64), len(spec.arms)
         names = spec.arms[0].joints
-        upper = [spec.joint(name) for name in spec.upper_joints]
+        upper = spec.upper_joint_specs
         own = [j.name if j.name in names else j.mirror_name for j in upper]
         self._source = torch.tensor([names.index(name) for name in own])
         self._sign = torch.tensor([1.0 if j.name in names else j.mirror_sign for j in upper], dtype=torch.float64)

@@ -60,7 +60,7 @@ def tour_stance(spec: RobotSpec) -> TourStance:
     angles = _angles(spec)
     scale = _standing_height_m(spec, angles) / _standing_height_m(g1(), _angles(g1()))
     shoulder, _ = body_frame(spec, spec.chain(spec.arms[0].hand_body, spec.torso_body)[0].name, spec.torso_body, angles)
-    arms = [spec.joint(name) for name in spec.upper_joints]
+    arms = spec.upper_joint_specs
     inertia = torch.tensor([j.armature_kg_m2 for j in arms])
     kp, kd = inertia * _NATURAL_RAD_S**2, 2.0 * _DAMPING_RATIO * inertia * _NATURAL_RAD_S
     return TourStance(
