@@ -255,8 +255,8 @@ def reads(law: str, field: str) -> bool:
     return field in READS.get(law, (field,))
 
 
-WITHOUT_STIFFNESS = ("pd", "soft-pd")
+WITHOUT_STIFFNESS = tuple(law for law, read in READS.items() if "stiffness" not in read)
 """Laws that command no stiffness of the hand."""
 
-SENSING_FORCE = ("facet", "cotap+facet", "cotap+facet-matched", "dcc")
+SENSING_FORCE = tuple(law for law, read in READS.items() if "sensing" in read)
 """Laws that move the hand's target by the force on it, and so must know that force."""
