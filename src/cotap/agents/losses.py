@@ -71,14 +71,13 @@ def generalized_advantages(
 
 LOWEST_RATE = 1e-5
 """Adam's steps at this rate hardly move a policy, whatever the gradient."""
+_HIGHEST_RATE, _RATE_FACTOR = 3e-3, 1.5
 
 
-def adapt_learning_rate(
-    rate: float, kl: float, desired_kl: float, low: float = LOWEST_RATE, high: float = 3e-3, factor: float = 1.5
-) -> float:
+def adapt_learning_rate(rate: float, kl: float, desired_kl: float) -> float:
     """Next learning rate: down when the policy moved more than twice `desired_kl`, up when less than half."""
     if kl > 2.0 * desired_kl:
-        return max(low, rate / factor)
+        return max(LOWEST_RATE, rate / _RATE_FACTOR)
     if 0.0 < kl < 0.5 * desired_kl:
-        return min(high, rate * factor)
+        return min(_HIGHEST_RATE, rate * _RATE_FACTOR)
     return rate
