@@ -575,6 +575,25 @@ def test_limits_of_safety_have_bounds(field, low, high):
             SafetyConfig(**{field: beyond}).check()
 
 
+@pytest.mark.parametrize(("settle_s", "fits"), [(0.0, True), (0.5, True), (2.0, False)])
+def test_settling_without_a_ramp_is_refused(settle_s, fits):
+    """The default is no wish of anyone's."""
+    safety = SafetyConfig(ramp_s=0.0, settle_s=settle_s)
+    if fits:
+        safety.check()
+    else:
+        with pytest.raises(ValueError, match="settle_s does nothing while ramp_s is 0"):
+            safety.check()
+
+
+@pytest.mark.parametrize(("ramp_s", "held"), [(0.0, []), (0.001, [True, False])])
+def test_a_ramp_of_no_step_still_settles(ramp_s, held, policy, spec, monkeypatch):
+    robot, seen = make_robot(spec), []
+    monkeypatch.setattr(robot.engine, "hold", seen.append)
+    start_up(robot, make_controller(policy, spec), SafetyConfig(ramp_s=ramp_s, settle_s=0.04), 0)
+    assert seen == held
+
+
 def test_keys_build_up_commands():
     stick = Stick()
     for key in "wwwa":

@@ -29,6 +29,8 @@ class SafetyConfig:
         """Raise ValueError naming the first field that is out of its range."""
         require_range("ramp_s", self.ramp_s, 0.0, 60.0)
         require_range("settle_s", self.settle_s, 0.0, 60.0)
+        if self.ramp_s == 0.0 and self.settle_s not in (0.0, SafetyConfig.settle_s):
+            raise ValueError(f"settle_s does nothing while ramp_s is 0, got {self.settle_s!r}")
         require_range("max_tilt", self.max_tilt, 0.1, 3.2)
         require_range("saturation_s", self.saturation_s, 0.02, 1e6)
 

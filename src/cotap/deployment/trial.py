@@ -50,9 +50,9 @@ def start_up(robot: Robot, controller: Controller, safety: SafetyConfig, seed: i
     default = np.array([j.default_rad for j in robot.spec.joints])
     pose = np.concatenate((default[: len(robot.spec.lower_joints)], controller.initial_arms))
     robot.start(pose, seed)
-    ramp = round(safety.ramp_s / controller.dt)
-    if ramp == 0:
+    if safety.ramp_s == 0.0:
         return
+    ramp = round(safety.ramp_s / controller.dt)
     free = np.zeros((len(robot.spec.arms), 3))
     robot.engine.hold(True)
     for k in range(ramp):
