@@ -114,7 +114,7 @@ class Scenario:
     right: str = ""
     """The right arm's law."""
     command: tuple[TimedCommand, ...] = ()
-    """In the order of their times."""
+    """In the order of their times, from 0 on."""
     force: tuple[ForceProfile, ...] = ()
     """On the hands, heading frame; they add up."""
 
@@ -127,6 +127,8 @@ class Scenario:
                 parse_law(side, text, LawConfig()).check()
         for i, command in enumerate(self.command):
             command.check(f"command[{i}]")
+            if i == 0 and command.at != 0.0:
+                raise ValueError(f"command[0].at must be 0, for the robot begins with it; got {command.at} s")
             if i and command.at < self.command[i - 1].at:
                 raise ValueError(f"command[{i}].at is {command.at} s, before the one ahead of it")
         for i, force in enumerate(self.force):

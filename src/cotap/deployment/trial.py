@@ -69,7 +69,7 @@ def run_trial(
 ) -> Trial:  # fmt: skip
     """Start the robot up and run the scenario until its end, a fall, or a stop and what follows it."""
     commands, dt, trial = list(scenario.command), controller.dt, Trial(controller.dt)
-    if commands and commands[0].at == 0.0:  # the robot begins with it, it need not change over
+    if commands:  # the robot begins with it, it need not change over
         commands[0].give(controller.commands, robot.spec.nominal_height_m)
     start_up(robot, controller, safety, seed)
     watchdog = Watchdog(safety, robot.spec.joint_names, robot.torque_limit, dt)
