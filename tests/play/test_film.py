@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
+import imageio.v2 as imageio
 import numpy as np
 import pytest
 from viser import transforms as tf
@@ -82,6 +84,18 @@ def test_a_film_shows_the_robots_of_the_recording_whatever_the_page_shows(archiv
     assert browser.downloads == {film.name: film.read_bytes()}
     assert film.read_bytes()[4:8] == b"ftyp"
     assert archive.notices == [f"written to {film}"]
+
+
+@pytest.mark.parametrize(("dt", "stride"), [(0.02, 2), (0.015, 3), (0.05, 1)])
+def test_a_film_lasts_as_long_as_what_it_shows(archive, scene, record, dt, stride):
+    recording = record(12, 1)
+    recording = replace(recording, trajectory=replace(recording.trajectory, dt=dt))
+    archive.keep(recording)
+    browser = Browser(archive, scene)
+    archive.film(browser, scene)
+    assert len(browser.seen) == 12 // stride
+    with imageio.get_reader(archive.path.with_suffix(".mp4")) as film:
+        assert film.get_meta_data()["fps"] == pytest.approx(1.0 / (stride * dt), abs=0.01)
 
 
 def test_a_browser_that_stops_drawing_leaves_no_film_and_the_page_as_it_was(archive, scene, record):

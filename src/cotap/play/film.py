@@ -11,10 +11,12 @@ import viser
 from cotap.evaluation.recording import Recording
 from cotap.evaluation.render import write_video
 from cotap.play.recorder import samples_of
+from cotap.play.sample import Sample
 from cotap.play.scene import Scene
 
 WIDTH, HEIGHT = 1280, 720
 FPS = 25.0
+"""About how many pictures a second a film has: a whole number of control steps apart."""
 TIMEOUT_S = 30.0
 """A browser that takes longer for one picture has stopped drawing, as one in the background does [s]."""
 
@@ -30,18 +32,19 @@ def film(client: viser.ClientHandle, scene: Scene, recording: Recording, path: P
         FilmError: the browser went away or stopped drawing; nothing is written.
         OSError: the file cannot be written.
     """
+    dt = recording.trajectory.dt
+    stride = max(1, round(1.0 / (FPS * dt)))
     shown, scene.shown = scene.shown, recording.trajectory.fell.shape[1]
     try:
-        write_video(path, _pictures(client, scene, recording), FPS)
+        write_video(path, _pictures(client, scene, samples_of(recording)[::stride]), 1.0 / (dt * stride))
     finally:
         scene.shown = shown
 
 
-def _pictures(client: viser.ClientHandle, scene: Scene, recording: Recording) -> Iterator[np.ndarray]:
-    stride = max(1, round(1.0 / (FPS * recording.trajectory.dt)))
+def _pictures(client: viser.ClientHandle, scene: Scene, samples: list[Sample]) -> Iterator[np.ndarray]:
     camera = client.camera
     pose = {"position": camera.position, "wxyz": camera.wxyz, "fov": camera.fov}
-    for sample in samples_of(recording)[::stride]:
+    for sample in samples:
         scene.show(sample)
         try:
             yield client.get_render(HEIGHT, WIDTH, timeout=TIMEOUT_S, **pose)[..., :3]
