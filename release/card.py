@@ -73,7 +73,8 @@ MEASURES = (
     Measure("velocity error, mean of a stride [m/s]", TRACKING, metric("e_lin_gait"), most(0.10), most(0.12)),
     Measure("yaw rate error [rad/s]", TRACKING, metric("e_yaw"), most(0.15)),
     Measure("the same, mean of a stride [rad/s]", TRACKING, metric("e_yaw_gait"), most(0.06)),
-    *(Measure(f"slope {axis}", TRACKING, slope(axis), (0.93, 1.07), (0.9, 1.1), 2) for axis in ("x", "y", "yaw")),
+    *(Measure(f"slope {axis}", TRACKING, slope(axis), (0.93, 1.07), (0.9, 1.1), 2)
+      for axis in ("x", "y", "yaw", "height")),
     Measure("height error [m]", TRACKING, metric("e_height"), most(0.03)),
     Measure("drift where it is to stand [m/s]", TRACKING, metric("stand_drift"), most(0.05)),
     Measure("share of that time that it is still", TRACKING, metric("still_share"), (0.9, 1.0), None, 2),
