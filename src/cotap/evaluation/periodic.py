@@ -149,7 +149,9 @@ def amplitude(values: torch.Tensor, period_s: float, dt: float) -> torch.Tensor:
     squares."""
     angle = 2.0 * math.pi * dt / period_s * torch.arange(values.shape[0])
     basis = torch.stack((torch.ones_like(angle), angle, angle.sin(), angle.cos()), 1)
-    return torch.linalg.lstsq(basis, values).solution[2:].norm(dim=0)
+    # In double precision, for how lstsq rounds differs from run to run.
+    solution = torch.linalg.lstsq(basis.double(), values.double()).solution
+    return solution[2:].norm(dim=0).to(values.dtype)
 
 
 def swing_curve(t: Trajectory, onset: int, elbows: list[int], sides: list[str]) -> dict[str, list[float]]:
