@@ -64,7 +64,7 @@ class Run:
     def __init__(self, folder: Path, prepare: Prepare | None = None, log: Path | None = None) -> None:
         self.folder = folder
         self.start = newest_iteration(folder)
-        resume = ["--resume", newest(folder)] if self.start else ["--run-dir", folder]
+        resume = ["--resume", newest_checkpoint(folder)] if self.start else ["--run-dir", folder]
         read, write = os.pipe()
         self.log = log or Path(f"{folder}.log")
         self._status: int | None = None
@@ -122,14 +122,9 @@ def _train(args: list[str], log: Path, beats: int, prepare: Prepare | None) -> N
         os._exit(status)
 
 
-def newest(folder: Path) -> Path | None:
-    """The newest checkpoint of a run, if it has one."""
-    return newest_checkpoint(folder)
-
-
 def newest_iteration(folder: Path) -> int:
     """How far a run can be gone on from."""
-    path = newest(folder)
+    path = newest_checkpoint(folder)
     return load_checkpoint(path)["iteration"] if path else 0
 
 
@@ -306,7 +301,11 @@ def diverge(work: Path) -> list[Row]:
         folder = work / f"diverged{len(rows)}"
         run = Run(folder, prepare)
         ok = run.wait() == 0 and "envs diverged 1 times" in run.log.read_text()
-        ok = ok and curve(folder, "episode/diverged")[-1][1] == 1.0 and _all_finite(load_checkpoint(newest(folder)))
+        ok = (
+            ok
+            and curve(folder, "episode/diverged")[-1][1] == 1.0
+            and _all_finite(load_checkpoint(newest_checkpoint(folder)))
+        )
         rows.append(Row(name, 1, int(ok), 0, "the env's episode ends, named and counted once; all else finite"))
     return rows
 
@@ -330,7 +329,7 @@ def bad_reward(work: Path) -> Row:
     run = Run(work / "reward", prepare)
     ok = run.wait() == 0 and "steps of agent 'lower' skipped" in run.log.read_text()
     ok = ok and sum(v for _, v in curve(run.folder, "agents/lower/skipped")) > 0.0
-    ok = ok and _all_finite(load_checkpoint(newest(run.folder))["model"])
+    ok = ok and _all_finite(load_checkpoint(newest_checkpoint(run.folder))["model"])
     return Row("NaN in a reward", 1, int(ok), 0, "one agent's steps of one iteration skipped, named and counted")
 
 

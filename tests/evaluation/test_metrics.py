@@ -298,7 +298,10 @@ def test_slopes_are_those_of_least_squares():
     got = summarize_slope(commanded, measured, mask)
     assert got["mean"] == pytest.approx(expected, rel=1e-4)
     assert got["n"] == 9
+    lost = measured.masked_fill(~mask, math.nan)  # as of robots whose simulation diverged
+    assert summarize_slope(commanded.masked_fill(~mask, math.nan), lost, mask) == got
     nothing = {"mean": None, "ci95": None, "n": 0}
+    assert summarize_slope(commanded[:1], measured[:1], torch.arange(10).unsqueeze(0) == 4) == nothing
     assert summarize_slope(torch.ones(50, 10), measured, mask) == nothing
     assert summarize_slope(commanded, measured, torch.zeros(50, 10, dtype=torch.bool)) == nothing
     t = trajectory(envs=3)

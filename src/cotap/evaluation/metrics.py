@@ -56,17 +56,21 @@ def summarize_slope(
 ) -> dict[str, Any]:
     """Least-squares slope, with intercept, of measured against commanded (T, N) where `mask` (T, N); a bootstrap over
     envs gives its 95 % interval, and `n` counts them. Where nothing was commanded to differ the numbers are null."""
-    if int(mask.sum()) < 2 or float(commanded[mask].double().var()) < 1e-9:
-        return {"mean": None, "ci95": None, "n": 0}
+    nothing = {"mean": None, "ci95": None, "n": 0}
+    if not mask.any():
+        return nothing
     counted = mask.any(0)
-    x, y, weight = (values[:, counted].double() for values in (commanded, measured, mask))
-    # Any origin will do for a slope; one amid the samples keeps the sums exact.
-    x, y = ((values - values[weight > 0.0].mean()) for values in (x, y))
-    of_env = torch.stack([(weight * values).sum(0) for values in (torch.ones_like(x), x, y, x * x, x * y)], 1)
-    n = len(of_env)
+    # Any origin will do for a slope; one amid the samples keeps the sums exact. What is not counted may not be finite.
+    x, y = (
+        (values.double() - values[mask].double().mean()).masked_fill(~mask, 0.0)[:, counted]
+        for values in (commanded, measured)
+    )
+    of_env = torch.stack([v.sum(0) for v in (mask[:, counted].double(), x, y, x * x, x * y)], 1)
+    mean, n = float(_slope_of(of_env.sum(0))), len(of_env)
+    if math.isnan(mean):
+        return nothing
     slopes = _slope_of(bootstrap_draws(n, seed, resamples).double() @ of_env)
     low, high = torch.nanquantile(slopes, torch.tensor([0.025, 0.975], dtype=torch.float64)).tolist()
-    mean = float(_slope_of(of_env.sum(0)))
     return {"mean": mean, "ci95": [min(low, mean), max(high, mean)], "n": n}
 
 
