@@ -64,16 +64,17 @@ def test_better_than_pd_is_better_in_all_three(book):
 
 def test_differences_are_those_of_the_rows(book):
     book.results |= {"a": measured(1.0), "b": measured(3.0)}
-    assert words.change(book, "b", "a", "e_torso") == "-2.000 [-2.141,-1.859]"  # 0.1 x sqrt(2) to either side
+    assert words.change(book, "b", "a", "e_torso") == "-2.000±0.141"  # 0.1 x sqrt(2) to either side
     assert book.differences["e_torso: a - b"]["difference"] == -2.0
 
 
 def test_numbers_are_shown_with_interval_or_reason():
-    assert words.number({"mean": 0.12345, "ci95": [0.1, 0.2]}) == "0.123 [0.100,0.200]"
+    assert words.number({"mean": 0.12345, "ci95": [0.1, 0.2]}) == "0.123±0.077"
     assert words.number({"mean": None, "ci95": None, "reason": "no env stood"}) == "(no env stood)"
     assert words.number({"mean": 31.0, "ci95": None, "reason": "wide"}, 0) == "31 (wide)"
     assert words.number(None) == "(not measured)"
-    assert words.hundredfold({"mean": 0.5, "ci95": [0.25, 0.75]}) == "50.0 [25.0,75.0]"
+    assert words.hundredfold({"mean": 0.5, "ci95": [0.25, 0.75]}) == "50.0±25.0"
+    assert words.share(7, 8) == "87.5 [52.9,97.8]"
     assert words.fallen({"num_falls": 1, "num_envs": 8}) == "12.5 [2.2,47.1]"
 
 
@@ -140,10 +141,10 @@ def test_an_ablation_outside_the_trainings_is_marked(book, monkeypatch):
         for text in tables
         if text.startswith("| what")
     )
-    assert rows["without the ratio"] == ["15.0", "**8.000 [7.900,8.100]**", "2.000 [1.900,2.100]"]
-    assert rows["goals observed"][1] == "4.000 [3.900,4.100]"
+    assert rows["without the ratio"] == ["15.0", "**8.000±0.100**", "2.000±0.100"]
+    assert rows["goals observed"][1] == "4.000±0.100"
     assert rows["CoTaP, three seeds"][1] == "2.000 (range 1.000 to 3.000; interval -2.968 to 6.968)"
-    assert rows["CoTaP"][1] == "9.000 [8.900,9.100]"  # another training, not marked
+    assert rows["CoTaP"][1] == "9.000±0.100"  # another training, not marked
     assert falls["goals observed"] == ["12.5 [2.2,47.1]"] * 3  # as of each seed, of all 1 of 8
     assert falls["CoTaP, three seeds"][0] == "12.5 (range 12.5 to 12.5; interval 12.5 to 12.5)"
     assert falls["without the ratio"] == ["**25.0 [7.1,59.1]**"] * 3
@@ -231,8 +232,8 @@ def test_the_upper_agent_is_set_against_the_raw_reference_env_by_env(book, monke
     page = "\n".join(book.lines)
     assert "| with | joint error | +1.0% [+0.0%,+2.0%] / " in page
     assert "| 5%: **yes** | 1.0%, 12.0% [3.0%,5.0%] | 0 | 7 / 5 |" in page
-    assert "| 0 | 0.400 [0.000,1.000] | - |" in page
-    assert "| 0.5 | 0.320 [0.000,1.000] | -20.0% [-20.0%,-20.0%] |" in page
+    assert "| 0 | 0.400±0.600 | - |" in page
+    assert "| 0.5 | 0.320±0.680 | -20.0% [-20.0%,-20.0%] |" in page
     assert "at least 20% better than the raw reference: **holds**, -40.0% [-40.0%,-40.0%]." in page
     assert (book.assets / "upper_agent.png").stat().st_size > 5000
     assert len(asked) == 5 + 3 + 4  # tracking at five shares; fidelity at three more than in the table
@@ -308,12 +309,12 @@ def test_the_tour_is_measured_in_both_engines_and_compared_run_by_run(robot, tmp
         for policy, law in (("base", ("--method", "pd")), ("cotap", ("--method", "pd")), ("cotap", compliant))
     }
     page = "\n".join(book.lines)
-    row = "0.5 [0.4,0.6] | 50.0 [40.0,60.0] | 50.0 [40.0,60.0] | 28.6 [22.9,34.4] | 0.0 [0.0,0.0] | 0.0 [0.0,0.0] |"
+    row = "0.5±0.1 | 50.0±10.0 | 50.0±10.0 | 28.6±5.7 | 0.0±0.0 | 0.0±0.0 |"
     assert f"| base | PD | MuJoCo | 64 | {row}" in page
     assert f"| cotap | CoTaP, K 300 | PyBullet | 50 | {row}" in page
     assert ("| homie | PD | MuJoCo / PhysX | 512 or more | 78.2 / 79 | 55 / 58 |" in page) == (robot == "g1")
-    assert "| mean survival [s] | 3.0 [2.0,4.0] better | 3.0 [2.0,4.0] better |" in page
-    assert "| completed [%] | 0.0 [-14.1,14.1] not distinguishable |" in page  # square-and-add of 10 and 10
+    assert "| mean survival [s] | 3.0±1.0 better | 3.0±1.0 better |" in page
+    assert "| completed [%] | 0.0±14.1 not distinguishable |" in page  # square-and-add of 10 and 10
     assert book.differences["tour, mujoco: survival_s"]["pairs"] == 2
 
 

@@ -7,7 +7,7 @@ from typing import Any
 from cotap.robots import ROBOTS
 from reports.paper.arms import CALM, PD, label
 from reports.paper.book import Book
-from reports.paper.words import hundredfold, missing
+from reports.paper.words import hundredfold, missing, share
 
 LAWS = {PD: ["--method", "pd"]} | {
     f"CoTaP, {k} N/m": ["--method", "cotap", "--stiffness", str(k)] for k in (100, 300, 800)
@@ -74,10 +74,7 @@ def field(book: Book) -> None:
 
 def upright(result: dict[str, Any]) -> str:
     """Share of trials without a fall to the end [%], with Wilson's interval."""
-    from cotap.evaluation.metrics import wilson_interval
-
-    share = 1.0 - result["num_falls"] / result["num_envs"]
-    return hundredfold({"mean": share, "ci95": list(wilson_interval(share, result["num_envs"]))})
+    return share(result["num_envs"] - result["num_falls"], result["num_envs"])
 
 
 def _key(name: str) -> str:

@@ -23,15 +23,26 @@ ALL_THREE = ("e_torso", "e_ee", "j_upper")
 
 
 def number(m: dict[str, Any] | None, digits: int = 3) -> str:
-    """A measure as mean and interval."""
+    """A measure as mean and the larger half of its interval."""
     if m is None:
         return NOT_MEASURED
     if m["mean"] is None:
         return f"({m['reason']})"
     if m["ci95"] is None:
         return f"{m['mean']:.{digits}f} ({m['reason']})"
-    low, high = m["ci95"]
-    return f"{m['mean']:.{digits}f} [{low:.{digits}f},{high:.{digits}f}]"
+    return f"{m['mean']:.{digits}f}{_half(m['mean'], m['ci95'], digits)}"
+
+
+def _half(mean: float, interval: list[float], digits: int) -> str:
+    return f"±{max(mean - interval[0], interval[1] - mean):.{digits}f}"
+
+
+def share(events: int, of_all: int) -> str:
+    """A share [%] with Wilson's interval, whose halves differ."""
+    from cotap.evaluation.metrics import wilson_interval
+
+    low, high = wilson_interval(events / of_all, of_all)
+    return f"{100.0 * events / of_all:.1f} [{100.0 * low:.1f},{100.0 * high:.1f}]"
 
 
 def hundredfold(m: dict[str, Any] | None, digits: int = 1) -> str:
@@ -48,10 +59,7 @@ def scaled(m: dict[str, Any] | None, factor: float, digits: int = 1) -> str:
 
 def fallen(result: dict[str, Any]) -> str:
     """Share of envs that fell by the end of the episode [%], with Wilson's interval."""
-    from cotap.evaluation.metrics import wilson_interval
-
-    share = result["num_falls"] / result["num_envs"]
-    return hundredfold({"mean": share, "ci95": list(wilson_interval(share, result["num_envs"]))})
+    return share(result["num_falls"], result["num_envs"])
 
 
 def missing(policy: str) -> str:
@@ -93,11 +101,11 @@ def compared(book: Book, first: str, second: str, measure: str) -> dict[str, Any
 
 
 def change(book: Book, first: str, second: str, measure: str, digits: int = 3) -> str:
-    """The second row less the first with the interval."""
+    """The second row less the first, and the larger half of the interval."""
     d = compared(book, first, second, measure)
     if d["difference"] is None:
         return f"({d['reason']})"
-    return f"{d['difference']:+.{digits}f} [{d['ci95'][0]:+.{digits}f},{d['ci95'][1]:+.{digits}f}]"
+    return f"{d['difference']:+.{digits}f}{_half(d['difference'], d['ci95'], digits)}"
 
 
 def verdict(book: Book, smaller: str, larger: str, measure: str, digits: int = 3) -> str:

@@ -18,7 +18,7 @@ from cotap.compliance import (
     resolve_joint_stiffness,
     singularity_aware_ratio,
 )
-from cotap.compliance.fast import blended_stiffness, eigenvalues_3x3, inverse_3x3
+from cotap.compliance.fast import blended_stiffness
 from cotap.compliance.stiffness import RANK_TOLERANCE, project_compliance
 from cotap.robots.chains import arm_chains
 
@@ -240,16 +240,6 @@ def test_the_fast_blend_is_as_exact_where_eigenvalues_nearly_coincide(apart: flo
     blend = blended_stiffness(j, task, null, pd, alpha).stiffness
     expected = 100.0**0.6 * torch.cat((200.0 * own.square(), null.reshape(1))).pow(0.4)
     torch.testing.assert_close(blend, torch.diag(expected), rtol=1e-11, atol=1e-9)
-
-
-def test_closed_forms_of_three_by_three(rng):
-    a = torch.randn(500, 3, 3, dtype=DOUBLE, generator=rng)
-    a = a @ a.transpose(-1, -2)
-    a[:3] = torch.diag_embed(torch.tensor([[1.0, 1.0, 1.0], [2.0, 2.0, 5.0], [0.0, 3.0, 3.0]], dtype=DOUBLE))
-    torch.testing.assert_close(eigenvalues_3x3(a), torch.linalg.eigvalsh(a), rtol=1e-7, atol=1e-7)
-    torch.testing.assert_close(
-        inverse_3x3(a[3:]) @ a[3:], torch.eye(3, dtype=DOUBLE).expand(497, 3, 3), atol=1e-6, rtol=0
-    )
 
 
 def test_condition_number_and_ratio_by_hand():

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import combinations
 
 import torch
 
-from cotap.compliance.arguments import full_precision
 from cotap.compliance.kinematics import ChainPose
-from cotap.rotations import rotate
+from cotap.compliance.small_matrices import batch_last, geometric_mean
 
 GRAVITY_M_S2 = 9.81
 
@@ -38,12 +36,12 @@ def gravity_torque(links: LinkInertias, pose: ChainPose, up: torch.Tensor) -> to
         pose: The arms' links in their root's frame.
         up: (W, 3) the vertical in the root's frame, unit length, pointing up.
     """
-    centers = pose.anchors + rotate(pose.rotations, links.com)
-    weighted = links.mass.unsqueeze(-1) * centers
-    lever = _carried(weighted, 2) - _carried(links.mass, 1).unsqueeze(-1) * pose.anchors
+    anchors, axes, _, centers = _links(links, pose)
+    weighted = links.mass[..., None, None] * centers
+    lever = _carried(weighted, 1) - _carried(links.mass, 1)[..., None, None] * anchors
     # The torque of gravity is axis . (lever x -g up); holding still takes the opposite.
-    lift = GRAVITY_M_S2 * up[:, None, None, :].expand_as(lever)
-    return (pose.axes * torch.linalg.cross(lever, lift)).sum(-1)
+    lift = GRAVITY_M_S2 * up.T.expand_as(lever)
+    return (axes * _cross(lever, lift)).sum(2).movedim(-1, 0)
 
 
 def joint_inertia(links: LinkInertias, pose: ChainPose) -> torch.Tensor:
@@ -52,9 +50,7 @@ def joint_inertia(links: LinkInertias, pose: ChainPose) -> torch.Tensor:
     By composite bodies: a joint that turns at unit rate gives all that it carries a momentum about the root's origin,
     and its inertia with a joint before it is that joint's own motion times that momentum.
     """
-    # Envs last: every operation then runs along them.
-    anchors, axes, rotations = (x.movedim(0, -1).contiguous() for x in (pose.anchors, pose.axes, pose.rotations))
-    centers = anchors + (rotations * links.com[..., None, :, None]).sum(3)
+    anchors, axes, rotations, centers = _links(links, pose)
     weighted = links.mass[..., None, None] * centers
     first_moment = _carried(weighted, 1)
     xx, xy, xz, yy, yz, zz = _carried(_about_origin(links, rotations, centers, weighted), 1).unbind(2)
@@ -71,6 +67,12 @@ def joint_inertia(links: LinkInertias, pose: ChainPose) -> torch.Tensor:
         inertia[:, i, i:] = inertia[:, i:, i] = shared
     inertia.diagonal(dim1=1, dim2=2).add_(links.armature.unsqueeze(1))
     return inertia.movedim(-1, 0)
+
+
+def _links(links: LinkInertias, pose: ChainPose) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Anchors, axes, rotations and centres of mass of the links, (A, n, ..., W): operations then run along the envs."""
+    anchors, axes, rotations = (x.movedim(0, -1).contiguous() for x in (pose.anchors, pose.axes, pose.rotations))
+    return anchors, axes, rotations, anchors + (rotations * links.com[..., None, :, None]).sum(3)
 
 
 def _about_origin(
@@ -103,54 +105,18 @@ def _cross(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     return torch.stack((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx), 2)
 
 
-@full_precision
 def critical_damping(stiffness: torch.Tensor, inertia: torch.Tensor, ratio: float = 1.0) -> torch.Tensor:
     """Joint damping (..., n, n) [Nms/rad] that damps every mode of `M q'' + D q' + K q = 0` by `ratio` of critical.
 
-    With `M = L L^T` and `S = L^-1 K L^-T`, `D = 2 ratio L sqrt(S) L^T`.
+    It is `2 ratio` times the geometric mean of K and M, `L (L^-1 K L^-T)^1/2 L^T` with `M = L L^T`.
 
     Args:
         stiffness: (..., n, n) symmetric positive definite [Nm/rad].
         inertia: (..., n, n) symmetric positive definite [kg m^2].
         ratio: Damping ratio.
     """
-    factor = torch.linalg.cholesky(inertia)
-    whitened = torch.linalg.solve_triangular(factor, stiffness, upper=False)
-    whitened = torch.linalg.solve_triangular(factor, whitened.transpose(-1, -2), upper=False)
-    size = stiffness.shape[-2:]
-    values, root = _diagonalized(whitened.reshape(-1, *size), factor.reshape(-1, *size))
-    half = (root * (2.0 * ratio * values.clamp_min(0.0).sqrt()).sqrt()).movedim(-1, 0)
-    return (half @ half.transpose(-1, -2)).reshape(stiffness.shape)
-
-
-def _diagonalized(symmetric: torch.Tensor, factor: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Eigenvalues (n, B) of positive definite matrices (B, n, n), and `factor` (B, n, n) times their eigenvectors, as
-    (n, n, B).
-
-    Jacobi's method, all matrices at once: the library's decomposition takes them one by one, which costs twice as long
-    for many small ones, and in single precision it is less exact where eigenvalues lie far apart. For n up to 7 as many
-    sweeps as there are columns leave what single precision rounds anyway; in double precision it is left, too.
-    """
-    n = symmetric.shape[-1]
-    both = torch.cat((symmetric, factor), 1).permute(1, 2, 0).contiguous()
-    matrix = both[:n]
-    transposed = matrix.transpose(0, 1)
-    tiny = torch.finfo(symmetric.dtype).tiny
-    for p, q in n * list(combinations(range(n), 2)):
-        twice, apart = 2.0 * matrix[p, q], matrix[q, q] - matrix[p, p]
-        width = torch.addcmul(twice * twice, apart, apart).sqrt_().add_(tiny)
-        tangent = twice / (apart + torch.copysign(width, apart))
-        cosine = (1.0 + tangent * tangent).rsqrt_()
-        sine = tangent * cosine
-        _rotate_columns(both, p, q, cosine, sine)
-        _rotate_columns(transposed, p, q, cosine, sine)
-    return matrix.diagonal().movedim(-1, 0), both[n:]
-
-
-def _rotate_columns(matrix: torch.Tensor, p: int, q: int, cosine: torch.Tensor, sine: torch.Tensor) -> None:
-    """Turn columns p and q of matrices (rows, n, B) into each other, in place."""
-    first, second = matrix[:, p], matrix[:, q]
-    matrix[:, p], matrix[:, q] = (
-        torch.addcmul(cosine * first, sine, second, value=-1.0),
-        torch.addcmul(sine * first, cosine, second),
-    )
+    k, m = batch_last(stiffness), batch_last(inertia)
+    unit = m.diagonal().movedim(-1, 0).rsqrt()
+    units = unit.unsqueeze(1) * unit  # in which every joint's own inertia is 1
+    mean = geometric_mean(k * units, m * units)
+    return (2.0 * ratio * mean / units).movedim(-1, 0).reshape(stiffness.shape)

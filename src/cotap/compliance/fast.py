@@ -15,10 +15,11 @@ differentiated: where eigenvalues coincide, the result is not finite.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 
+from cotap.compliance.small_matrices import batch_last, eigenvalues_3x3, inverse_3x3, plus_diagonal, product
 from cotap.compliance.stiffness import RANK_TOLERANCE
 
 _ROUNDING = 1e-14
@@ -45,48 +46,6 @@ class ArmStiffness:
     largest gain."""
 
 
-def eigenvalues_3x3(a: torch.Tensor) -> torch.Tensor:
-    """Eigenvalues (..., 3), ascending, of symmetric positive semidefinite matrices (..., 3, 3)."""
-    xx, xy, xz, yy, yz, zz = _entries(a)
-    mean = (xx + yy + zz) / 3.0
-    dx, dy, dz = xx - mean, yy - mean, zz - mean
-    xy2, xz2, yz2 = xy * xy, xz * xz, yz * yz
-    square = (dx * dx + dy * dy + dz * dz + 2.0 * (xy2 + xz2 + yz2)) / 6.0
-    spread = square.sqrt()
-    tiny = torch.finfo(a.dtype).tiny
-    determinant = dx * (dy * dz - yz2) - xy2 * dz - xz2 * dy + 2.0 * xy * xz * yz
-    angle = torch.acos((0.5 * determinant / (square * spread).clamp_min(tiny)).clamp_(-1.0, 1.0)) / 3.0
-    largest = mean + 2.0 * spread * angle.cos()
-    smallest = mean + 2.0 * spread * (angle + 2.0 * torch.pi / 3.0).cos()
-    middle = 3.0 * mean - largest - smallest
-    # Beside two large eigenvalues the formula loses the digits of a small one; the determinant keeps them.
-    product = (middle * largest).clamp_min(tiny)
-    whole = xx * (yy * zz - yz2) - xy2 * zz - xz2 * yy + 2.0 * xy * xz * yz
-    smallest = torch.where(smallest < 1e-3 * largest, whole / product, smallest)
-    return torch.stack((smallest, middle, largest), -1)
-
-
-def inverse_3x3(a: torch.Tensor) -> torch.Tensor:
-    """Inverses (..., 3, 3) of symmetric matrices (..., 3, 3)."""
-    xx, xy, xz, yy, yz, zz = _entries(a)
-    cxx, cxy, cxz = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
-    cyy, cyz, czz = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
-    adjugate = torch.stack((cxx, cxy, cxz, cxy, cyy, cyz, cxz, cyz, czz), -1)
-    return (adjugate / (xx * cxx + xy * cxy + xz * cxz).unsqueeze(-1)).unflatten(-1, (3, 3))
-
-
-def _entries(a: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    """The six different entries (...) of symmetric matrices (..., 3, 3), each contiguous."""
-    return a.flatten(-2)[..., [0, 1, 2, 4, 5, 8]].movedim(-1, 0).contiguous().unbind(0)
-
-
-def _plus(a: torch.Tensor, shift: torch.Tensor) -> torch.Tensor:
-    """`a + shift I` for matrices (..., 3, 3) and numbers (...)."""
-    out = a.clone()
-    torch.diagonal(out, dim1=-2, dim2=-1).add_(shift.unsqueeze(-1))
-    return out
-
-
 def blended_stiffness(
     jacobian: torch.Tensor, task_stiffness: torch.Tensor, null_stiffness: torch.Tensor, pd_stiffness: torch.Tensor,
     alpha: torch.Tensor, threshold: float = 10.0,
@@ -106,80 +65,81 @@ def blended_stiffness(
         threshold: Condition number up to which alpha is kept. If it is infinite, alpha is kept everywhere and lost rank
             is not made up for: the paper's law without its ratio.
     """
-    j = jacobian.double()
-    tolerance = 0.0 if math.isinf(threshold) else RANK_TOLERANCE
-    squares = eigenvalues_3x3(j @ j.transpose(-1, -2))
+    j = batch_last(jacobian.double())
+    squares = _squares(j)
     singularity = 1.0 / (1.0 + (_condition(squares) - threshold).clamp_min(0.0))
-    ratio = alpha.double() * singularity
-    if pd_stiffness.dim() < jacobian.dim() - 1:
-        return _in_one_gain(
-            j, squares, task_stiffness, null_stiffness, pd_stiffness, ratio, singularity, tolerance, jacobian.dtype
-        )
-    largest = pd_stiffness.double().amax(-1)
-    root = (pd_stiffness.double() / largest.unsqueeze(-1)).sqrt()
-    j = j / root.unsqueeze(-2)
-    squares = eigenvalues_3x3(j @ j.transpose(-1, -2))
-    blend = _in_one_gain(
-        j, squares, task_stiffness, null_stiffness, largest, ratio, singularity, tolerance, jacobian.dtype
-    )
-    rows, columns = root.to(jacobian.dtype).unsqueeze(-1), root.to(jacobian.dtype).unsqueeze(-2)
-    return replace(
-        blend, stiffness=rows * blend.stiffness * columns, pseudo_inverse=blend.pseudo_inverse / rows,
-        null_projector=blend.null_projector / rows * columns,
-    )  # fmt: skip
+    ratio, null = alpha.double().flatten() * singularity, null_stiffness.double().flatten()
+    pd, root = pd_stiffness.double(), None
+    if pd.dim() == jacobian.dim() - 1:
+        root = (pd / pd.amax(-1, keepdim=True)).sqrt().reshape(-1, pd.shape[-1]).T.contiguous()
+        pd, j = pd.amax(-1), j / root
+        squares = _squares(j)
+    tolerance = 0.0 if math.isinf(threshold) else RANK_TOLERANCE
+    missing = (tolerance**2 * squares[2].clamp_min(1e-12) - squares[0]).clamp_min(0.0)
+    pseudo_inverse, projector = _null_space(j, squares, missing)
+    # A direction that the arm can hardly move in is as stiff as the damped null space makes it.
+    lost = missing / (squares[0].clamp_min(0.0) + missing + 1e-300) * null
+    if task_stiffness.dim() == jacobian.dim():
+        b = product(batch_last(torch.linalg.cholesky(task_stiffness.double()).mT), j)
+    else:
+        b = task_stiffness.double().sqrt().reshape(-1, 3).T.unsqueeze(1) * j
+    stiffness, spectrum = _power(b, projector, lost, null, pd.flatten(), ratio)
+    if root is not None:
+        rows = root.unsqueeze(1)
+        stiffness, pseudo_inverse, projector = rows * stiffness * root, pseudo_inverse / rows, projector / rows * root
+    shape = jacobian.shape[:-2]
+    values = (stiffness, pseudo_inverse, projector, ratio, singularity, spectrum)
+    return ArmStiffness(*(x.to(jacobian.dtype).movedim(-1, 0).reshape(shape + x.shape[:-1]) for x in values))
+
+
+def _squares(j: torch.Tensor) -> torch.Tensor:
+    """Squared singular values (3, B), ascending, of Jacobians (3, n, B)."""
+    return eigenvalues_3x3(product(j, j.transpose(0, 1)))
 
 
 def _condition(squares: torch.Tensor) -> torch.Tensor:
-    """Condition number (...) of a Jacobian, of its squared singular values (..., 3)."""
-    largest = squares[..., 2].clamp_min(1e-12)
-    return (largest / squares[..., 0].clamp_min(1e-14 * largest)).sqrt()
+    """Condition number (B,) of a Jacobian, of its squared singular values (3, B)."""
+    largest = squares[2].clamp_min(1e-12)
+    return (largest / squares[0].clamp_min(1e-14 * largest)).sqrt()
 
 
-def _in_one_gain(
-    j: torch.Tensor, squares: torch.Tensor, task_stiffness: torch.Tensor, null_stiffness: torch.Tensor,
-    pd_stiffness: torch.Tensor, ratio: torch.Tensor, singularity: torch.Tensor, tolerance: float,
-    kind: torch.dtype,
-) -> ArmStiffness:  # fmt: skip
-    """`blended_stiffness` for one gain (...), of a Jacobian in float64 and its squared singular values."""
-    gram = j @ j.transpose(-1, -2)
-    largest = squares[..., 2].clamp_min(1e-12)
-    missing = (tolerance**2 * largest - squares[..., 0]).clamp_min(0.0)
-    eye = torch.eye(j.shape[-1], dtype=j.dtype, device=j.device)
-    transposed = j.transpose(-1, -2)
-    pseudo_inverse = transposed @ inverse_3x3(_plus(gram, missing.maximum(_ROUNDING * largest)))
-    # The projector itself is as exact as doubles allow: the rank that is lost is made up for in the power below.
-    null_projector = eye - transposed @ inverse_3x3(_plus(gram, _ROUNDING * largest)) @ j
-    if task_stiffness.dim() == j.dim():
-        b = torch.linalg.cholesky(task_stiffness.double()).transpose(-1, -2) @ j
-    else:
-        b = task_stiffness.double().sqrt().unsqueeze(-1) * j
-    inner = b @ b.transpose(-1, -2)
+def _null_space(j: torch.Tensor, squares: torch.Tensor, missing: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Of Jacobians (3, n, B), the pseudo-inverse (n, 3, B), damped by what is `missing`, and the projector (n, n, B).
+
+    The projector itself is as exact as doubles allow: the rank that is lost is made up for in the power.
+    """
+    transposed, rounding = j.transpose(0, 1), _ROUNDING * squares[2].clamp_min(1e-12)
+    gram = product(j, transposed)
+    damped, exact = (inverse_3x3(plus_diagonal(gram, shift)) for shift in (missing.maximum(rounding), rounding))
+    of_hand = product(transposed, product(exact, j))
+    return product(transposed, damped), plus_diagonal(-of_hand, torch.ones_like(rounding))
+
+
+def _power(
+    b: torch.Tensor, projector: torch.Tensor, lost: torch.Tensor, null: torch.Tensor, pd: torch.Tensor,
+    ratio: torch.Tensor,
+) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
+    """`pd^(1-a) (B^T G^(a-1) B + null^a N)`, (n, n, B), for a `ratio` a, and its outermost eigenvalues (2, B).
+
+    `lost` is what the damped null space adds to the smallest eigenvalue of G.
+    """
+    inner = product(b, b.transpose(0, 1))
     values = eigenvalues_3x3(inner)
-    values = values.maximum(_ROUNDING * values[..., 2:].clamp_min(1e-12))
-    null, pd = null_stiffness.double(), pd_stiffness.double()
-    # A direction that the arm can hardly move in is as stiff as the damped null space makes it.
-    lost = missing / (squares[..., 0].clamp_min(0.0) + missing + 1e-300)
-    stiff = torch.cat((values[..., :1] + (lost * null).unsqueeze(-1), values[..., 1:]), -1)
-    scale = pd.pow(1.0 - ratio)
-    power = _through(inner, values, stiff.pow(ratio.unsqueeze(-1)) / values, ratio - 1.0)
-    of_null = null.pow(ratio)
-    task = b.transpose(-1, -2) @ power @ b
-    stiffness = scale[..., None, None] * (task + of_null[..., None, None] * null_projector)
-    ends = stiff[..., [0, 2]].pow(ratio.unsqueeze(-1))
-    spectrum = torch.stack((torch.minimum(ends[..., 0], of_null), torch.maximum(ends[..., 1], of_null)), -1)
-    return ArmStiffness(
-        stiffness.to(kind), pseudo_inverse.to(kind), null_projector.to(kind), ratio.to(kind), singularity.to(kind),
-        (scale.unsqueeze(-1) * spectrum).to(kind),
-    )  # fmt: skip
+    values = values.maximum(_ROUNDING * values[2].clamp_min(1e-12))
+    stiff = torch.stack((values[0] + lost, values[1], values[2])).pow(ratio)
+    scale, of_null = pd.pow(1.0 - ratio), null.pow(ratio)
+    task = product(b.transpose(0, 1), product(_through(inner, values, stiff / values, ratio - 1.0), b))
+    stiffness = scale * (task + of_null * projector)
+    return stiffness, scale * torch.stack((torch.minimum(stiff[0], of_null), torch.maximum(stiff[2], of_null)))
 
 
 def _through(matrix: torch.Tensor, values: torch.Tensor, images: torch.Tensor, exponent: torch.Tensor) -> torch.Tensor:
-    """The function (..., 3, 3) of `matrix` that takes its ascending eigenvalues to `images`, (..., 3) both.
+    """The function (3, 3, B) of `matrix` that takes its ascending eigenvalues to `images`, (3, B) both.
 
     Newton's polynomial; where eigenvalues nearly coincide, derivatives of `x^exponent` stand in for its differences.
     """
-    low, middle, high = values.unbind(-1)
-    f_low, f_middle, f_high = images.unbind(-1)
+    low, middle, high = values
+    f_low, f_middle, f_high = images
     first = _divided(f_low, f_middle, low, middle, exponent)
     second = _divided(f_middle, f_high, middle, high, exponent)
     gap = high - low
@@ -189,8 +149,8 @@ def _through(matrix: torch.Tensor, values: torch.Tensor, images: torch.Tensor, e
         0.5 * exponent * (exponent - 1.0) * middle.pow(exponent - 2.0),
         (second - first) / torch.where(close, torch.ones_like(gap), gap),
     )
-    slope = _plus(third[..., None, None] * matrix, first - third * middle)
-    return _plus(_plus(matrix, -low) @ slope, f_low)
+    slope = plus_diagonal(third * matrix, first - third * middle)
+    return plus_diagonal(product(plus_diagonal(matrix, -low), slope), f_low)
 
 
 def _divided(

@@ -9,12 +9,13 @@ import torch
 
 from cotap.checks import require_one_of, require_range
 from cotap.compliance.admittance import AdmittanceLaw, StaticShift, VirtualMass
-from cotap.compliance.arguments import full_precision, symmetric_part
+from cotap.compliance.arguments import full_precision
 from cotap.compliance.dynamics import critical_damping, gravity_torque, joint_inertia
-from cotap.compliance.fast import ArmStiffness, blended_stiffness, inverse_3x3
+from cotap.compliance.fast import ArmStiffness, blended_stiffness
 from cotap.compliance.impedance import BlendedTorqueLaw
 from cotap.compliance.interface import Arms, ArmState, LawParameters, LawReport, TorqueLaw, UpperBodyLaw
 from cotap.compliance.pose_task import blended_pose_stiffness, pose_jacobian
+from cotap.compliance.small_matrices import inverse_3x3
 from cotap.compliance.stiffness import project_compliance
 
 ERRORS = ("joint", "task")
@@ -197,7 +198,7 @@ def _arm_stiffness(
     if base_compliance_h is None:
         return stiffness, torch.zeros_like(stiffness[..., 0], dtype=torch.bool)
     compliance, projected = project_compliance(torch.diag_embed(1.0 / stiffness) - base_compliance_h, LEAST_COMPLIANCE)
-    return symmetric_part(inverse_3x3(compliance)), projected
+    return inverse_3x3(compliance.movedim((-2, -1), (0, 1))).movedim((0, 1), (-2, -1)), projected
 
 
 def _cotap(arms: Arms, cfg: LawConfig) -> UpperBodyLaw:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from cotap.compliance.fast import eigenvalues_3x3, inverse_3x3
+from cotap.compliance.small_matrices import eigenvalues_3x3, inverse_3x3, plus_diagonal
 from cotap.compliance.stiffness import RANK_TOLERANCE
 from cotap.envs import HumanoidEnv
 from cotap.evaluation.metrics import masked_mean
@@ -62,9 +62,8 @@ class ArmWatch:
 def condition_number(jacobian: torch.Tensor) -> torch.Tensor:
     """Condition number (...) of Jacobians (..., 3, n), at most `WORST_CONDITION`; in closed form, for many at once."""
     j = jacobian.double()
-    squares = eigenvalues_3x3(j @ j.transpose(-1, -2))
-    least = squares[..., 2] / WORST_CONDITION**2
-    return (squares[..., 2] / squares[..., 0].maximum(least)).sqrt().float()
+    smallest, _, largest = eigenvalues_3x3((j @ j.mT).movedim((-2, -1), (0, 1)))
+    return (largest / smallest.maximum(largest / WORST_CONDITION**2)).sqrt().float()
 
 
 def null_share(jacobian: torch.Tensor, stiffness: torch.Tensor) -> torch.Tensor:
@@ -77,9 +76,8 @@ def null_share(jacobian: torch.Tensor, stiffness: torch.Tensor) -> torch.Tensor:
     """
     j = jacobian.double()
     compliance = torch.linalg.inv_ex(stiffness.double()).inverse
-    gram = j @ j.transpose(-1, -2)
-    floor = 1e-14 * torch.diagonal(gram, dim1=-2, dim2=-1).sum(-1)
-    inverse = inverse_3x3(gram + floor[..., None, None] * torch.eye(3, dtype=gram.dtype, device=gram.device))
+    gram = (j @ j.mT).movedim((-2, -1), (0, 1))
+    inverse = inverse_3x3(plus_diagonal(gram, 1e-14 * gram.diagonal().sum(-1))).movedim((0, 1), (-2, -1))
     # J# J is the projector on motion that moves the hand.
     of_hand = (inverse * (j @ compliance @ j.transpose(-1, -2))).sum((-1, -2))
     return (1.0 - of_hand / torch.diagonal(compliance, dim1=-2, dim2=-1).sum(-1)).float()
