@@ -1,0 +1,70 @@
+"""Ablations and seeds are trained one after another, go on where they stopped, and end in the next command."""
+
+from __future__ import annotations
+
+import pytest
+
+from cotap.agents.checkpoint import save_checkpoint
+from cotap.configs import DISTILL_RECIPES
+from reports import train_ablations
+from reports.paper.book import POLICIES
+from reports.train_ablations import TRAININGS, main
+
+
+@pytest.fixture
+def asked(monkeypatch) -> list[list[str]]:
+    """What was asked of the training of stage 2, which reaches its third iteration of as many as are given."""
+    calls: list[list[str]] = []
+
+    def run_stage(stage: str, args: list[str]) -> None:
+        assert stage == "distill"
+        calls.append(args)
+        folder = train_ablations.Path(args[args.index("--run-dir") + 1])
+        folder.mkdir(parents=True, exist_ok=True)
+        iterations = int(args[args.index("--iterations") + 1])
+        training = {"runner": {"iterations": iterations}}
+        content = {"iteration": 3, "config": {"training": training}, "layout": {"robot": "g1"}}
+        save_checkpoint(folder / "checkpoint_000003.pt", content)
+
+    monkeypatch.setattr(train_ablations, "run_stage", run_stage)
+    return calls
+
+
+def test_each_has_a_row_in_the_tables_and_a_recipe():
+    assert set(TRAININGS) == set(POLICIES) - {"cotap", "base"}
+    assert {args[1] for args in TRAININGS.values()} <= DISTILL_RECIPES.keys()
+    assert len({tuple(args) for args in TRAININGS.values()}) == len(TRAININGS)
+
+
+def test_all_are_trained_and_the_next_command_names_them(asked, tmp_path, capsys):
+    assert main(["--run-dir", str(tmp_path), "--iterations", "3", "--threads", "1"]) == 0
+    assert [args[: len(begin)] for args, begin in zip(asked, TRAININGS.values(), strict=True)] == [*TRAININGS.values()]
+    for name, args in zip(TRAININGS, asked, strict=True):
+        rest = ["--iterations", "3", "--threads", "1", "--run-dir", str(tmp_path / name), "--resume", "auto"]
+        assert args[len(TRAININGS[name]) :] == rest
+    said = capsys.readouterr().out
+    assert f"--robot g1 --policies seed-0={tmp_path}/seed-0/checkpoint_000003.pt" in said
+    assert f" facet={tmp_path}/facet/checkpoint_000003.pt\n" in said
+
+
+def test_one_that_is_stopped_ends_it(asked, tmp_path, capsys):
+    assert main(["--run-dir", str(tmp_path), "--only", "goals", "facet", "--iterations", "4"]) == 130
+    assert len(asked) == 1
+    assert "stopped at iteration 3 of 4 of" in capsys.readouterr().err
+
+
+def test_bad_names_and_options_are_refused(tmp_path, capsys):
+    assert main(["--only", "gaols"]) == 2
+    assert "--only" in capsys.readouterr().err
+    assert main(["--run-dir", str(tmp_path), "--base-checkpoint", str(tmp_path / "none.pt")]) == 2
+    assert "none.pt" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_two_are_trained_from_the_shipped_base(tmp_path, capsys):
+    small = ["--run-dir", str(tmp_path), "--num-envs", "8", "--iterations", "1", "--threads", "1"]
+    for _ in range(2):  # the second time there is nothing left to do
+        assert main([*small, "--only", "seed-1", "goals"]) == 0
+        assert capsys.readouterr().out.count("checkpoint_000001.pt") >= 2
+    assert len(list((tmp_path / "seed-1").glob("checkpoint_*.pt"))) == 1
