@@ -67,16 +67,16 @@ def _entries(a: torch.Tensor) -> tuple[torch.Tensor, ...]:
 def inverse(matrix: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Inverses of positive definite matrices (n, n, B), by sweeps over the diagonal, and the logarithms (B,) of their
     determinants."""
-    swept = matrix.clone()
-    logarithm = torch.zeros_like(matrix[0, 0])
+    swept, pivots = matrix.clone(), []
     for i in range(len(matrix)):
-        pivot, column = swept[i, i].clone(), swept[i].clone()
-        logarithm += pivot.log()
-        row = column / pivot
+        column = swept[i].clone()
+        pivots.append(column[i])
+        over = column[i].reciprocal()
+        row = column * over
         swept.addcmul_(column.unsqueeze(1), row, value=-1.0)
         swept[i] = swept[:, i] = row
-        swept[i, i] = -1.0 / pivot
-    return swept.neg_(), logarithm
+        swept[i, i] = -over
+    return swept.neg_(), torch.stack(pivots).log_().sum(0)
 
 
 _ITERATIONS = 6
