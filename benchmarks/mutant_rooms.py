@@ -5,7 +5,7 @@ from __future__ import annotations
 HELP = "tests/test_command_line.py::test_help_is_what_the_parsers_read"
 """Knows the default of every option."""
 LAWS, PASSIVE, STIFFNESS, SPD = (f"tests/compliance/test_{n}.py" for n in ("laws", "passive_law", "stiffness", "spd"))
-AUTOCAST, ADMITTANCE = (f"tests/compliance/test_{n}.py" for n in ("autocast", "admittance"))
+AUTOCAST, ADMITTANCE, SMALL = (f"tests/compliance/test_{n}.py" for n in ("autocast", "admittance", "small_matrices"))
 PASSIVITY, DYNAMICS, KINEMATICS, INVERSE, TORSO = (
     f"tests/compliance/test_{n}.py" for n in ("passivity", "dynamics", "kinematics", "inverse_kinematics", "torso")
 )
@@ -32,6 +32,7 @@ ROOMS: dict[str, dict[str, tuple[str, ...]]] = {
         "src/cotap/compliance/passive_law.py": (PASSIVE,),
         "src/cotap/compliance/passivity.py": (PASSIVITY,),
         "src/cotap/compliance/pose_task.py": ("tests/compliance/test_pose_task.py",),
+        "src/cotap/compliance/small_matrices.py": (SMALL, DYNAMICS, STIFFNESS),
         "src/cotap/compliance/spd.py": (SPD, STIFFNESS),
         "src/cotap/compliance/stiffness.py": (STIFFNESS, LAWS),
         "src/cotap/compliance/torso.py": (TORSO,),
