@@ -81,6 +81,8 @@ def measure(options: Options) -> dict[str, Any]:
     rows = {}
     for name, law in ROWS.items():
         loop = lead(spring_of(law, arms, target), arms, target, path)
+        if not loop.found.any():
+            raise ValueError(f"{name}: no arm comes to rest all along its path; take smaller circles, or more poses")
         drawn, stored = (torch.where(loop.found, x, torch.nan) for x in (loop.work().abs(), loop.stored()))
         rows[name] = {
             "drawn": summarize(drawn.flatten(), options.seed),
@@ -107,7 +109,8 @@ def table(result: dict[str, Any]) -> str:
     o = result["settings"]
     about = (
         f"Circles of {100 * o['radius']:g} cm in random planes, their centres {100 * o['offset']:g} cm from where the "
-        f"hand is sent; of {2 * o['poses']} paths, the others leave the arm's reach. Mean (95 % interval) over paths."
+        f"hand is sent; of {2 * o['poses']} paths, those along which the arm comes to rest everywhere, and in the end "
+        "where it began. Mean (95 % interval) over paths."
     )
     return "\n".join([*lines, "", about])
 

@@ -137,6 +137,11 @@ def test_a_path_out_of_reach_is_not_found(arms, target, rng):
     assert not loop.found.any()
 
 
+def test_paths_that_no_arm_can_follow_are_named(tmp_path, capsys):
+    assert script.main(["--poses", "1", "--points", "8", "--radius", "0.5", "--output", str(tmp_path)]) == 2
+    assert "PD: no arm comes to rest all along its path" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_the_script_writes_its_table(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(script, "ROWS", {k: v for k, v in script.ROWS.items() if k == "PD" or "joint error, 300" in k})
