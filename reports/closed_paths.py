@@ -17,7 +17,7 @@ import torch
 import tyro
 
 from cotap.agents.checkpoint import write_json
-from cotap.checks import require_positive_int, require_range, require_seed
+from cotap.checks import require_one_of, require_positive_int, require_range, require_seed
 from cotap.compliance.laws import LawConfig
 from cotap.configs import to_plain
 from cotap.evaluation.metrics import summarize
@@ -48,6 +48,8 @@ ROWS: dict[str, LawConfig] = {
 class Options:
     """How hands are led."""
 
+    robot: str = "h1"
+    """Whose arms."""
     poses: int = 64
     """Poses that are sent, of both arms."""
     radius: float = 0.05
@@ -63,6 +65,7 @@ class Options:
 
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
+        require_one_of("robot", self.robot, ROBOTS.keys())
         require_positive_int("poses", self.poses)
         require_range("radius", self.radius, 1e-4, 0.5)
         require_range("offset", self.offset, 0.0, 0.5)
@@ -72,7 +75,7 @@ class Options:
 
 def measure(options: Options) -> dict[str, Any]:
     """Every row: energy drawn per turn, in the direction in which it is drawn [J], and what it is a share of."""
-    spec, rng = ROBOTS["h1"](), torch.Generator().manual_seed(options.seed)
+    spec, rng = ROBOTS[options.robot](), torch.Generator().manual_seed(options.seed)
     arms = arm_model(spec).to(torch.float64)
     default = torch.tensor([spec.joint(name).default_rad for name in spec.upper_joints], dtype=torch.float64)
     default = default.reshape(1, len(spec.arms), -1)

@@ -142,6 +142,14 @@ def test_paths_that_no_arm_can_follow_are_named(tmp_path, capsys):
     assert "PD: no arm comes to rest all along its path" in capsys.readouterr().err
 
 
+def test_arms_of_every_robot_are_led(monkeypatch):
+    monkeypatch.setattr(script, "ROWS", {"PD": LawConfig("pd")})
+    options = script.Options(robot="g1", poses=2, points=8, radius=0.02, offset=0.01)
+    row = script.measure(options)["rows"]["PD"]
+    assert row["drawn"]["n"] > 0
+    assert row["largest"] < 1e-3
+
+
 @pytest.mark.slow
 def test_the_script_writes_its_table(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(script, "ROWS", {k: v for k, v in script.ROWS.items() if k == "PD" or "joint error, 300" in k})
@@ -151,3 +159,5 @@ def test_the_script_writes_its_table(tmp_path, monkeypatch, capsys):
     assert (tmp_path / "closed_paths.md").read_text() == capsys.readouterr().out
     assert script.main(["--points", "3"]) == 2
     assert "points must lie in" in capsys.readouterr().err
+    assert script.main(["--robot", "h2"]) == 2
+    assert "robot 'h2' is unknown" in capsys.readouterr().err
