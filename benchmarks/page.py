@@ -323,7 +323,7 @@ def main(argv: list[str] | None = None) -> int:
     """Parse, run, report. Returns the exit status: 0, or 2 for bad input."""
     args = list(sys.argv[1:] if argv is None else argv)
     if not args or args[0] in ("-h", "--help"):
-        print(f"usage: play_page.py COMMAND [options]; commands: {', '.join(COMMANDS)}")
+        print(f"usage: python -m benchmarks.page COMMAND [options]; commands: {', '.join(COMMANDS)}")
         return 0 if args else 2
     try:
         kind = COMMANDS[require_one_of("command", args[0], COMMANDS.keys())]

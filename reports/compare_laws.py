@@ -281,6 +281,8 @@ class Properties:
     """What backs Table I: effect of the stiffness commanded, of a wrong model, growth of the loop, energy drawn."""
 
     stability: Stability = field(default_factory=Stability)
+    robot: str = "h1"
+    """Whose arms."""
     stiffness: float = 500.0
     """[N/m]; the effect of changing it is that between half and twice of it."""
     null_stiffness: float = LawConfig.null_stiffness
@@ -303,13 +305,17 @@ class Properties:
     def measure(self) -> dict[str, Any]:
         """All of it, by row."""
         self.stability.check()
+        require_range("load", self.load, 0.1, 1000.0)
+        require_range("settle_seconds", self.settle_seconds, 2.0, 600.0)
         rows = {}
         for name in self.laws:
             k = self.stiffness
             (soft, stiff, right), at = self._moved(name, (0.5 * k, 2.0 * k, k))
             (wrong,), misled = self._moved(name, (k,), wrong=True)
             arms = laws_of(name, self.stiffness, self.null_stiffness).configure()
-            cfg = self.stability.configure(HumanoidEnvConfig(backend="mujoco", num_threads=self.threads))
+            cfg = self.stability.configure(
+                HumanoidEnvConfig(robot=self.robot, backend="mujoco", num_threads=self.threads)
+            )
             cfg.upper_body = arms
             env = HumanoidEnv(cfg)
             rows[name] = {
@@ -328,7 +334,7 @@ class Properties:
         Pelvis fixed; the stiffness of the hand without a load is the last.
         """
         protocol = StaticStiffness(num_envs=1 + len(stiffness), levels=2, settle_seconds=self.settle_seconds)
-        cfg = protocol.configure(HumanoidEnvConfig(backend="mujoco", num_threads=self.threads))
+        cfg = protocol.configure(HumanoidEnvConfig(robot=self.robot, backend="mujoco", num_threads=self.threads))
         cfg.upper_body = laws_of(name, stiffness[-1], self.null_stiffness).configure()
         env = HumanoidEnv(cfg)
         if wrong:
@@ -402,7 +408,7 @@ def main(argv: list[str] | None = None) -> int:
     args = list(sys.argv[1:] if argv is None else argv)
     try:
         if not args or args[0] in ("-h", "--help"):
-            print(f"usage: compare_laws.py TABLE [options]; tables: {', '.join(TABLES)}")
+            print(f"usage: python -m reports.compare_laws TABLE [options]; tables: {', '.join(TABLES)}")
             return 0 if args else 2
         kind = TABLES[require_one_of("table", args[0], TABLES.keys())]
         options = tyro.cli(kind, args=args[1:], prog=f"python -m reports.compare_laws {args[0]}")

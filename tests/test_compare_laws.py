@@ -125,8 +125,9 @@ def test_the_page_of_the_properties_is_the_table_of_its_numbers():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [(["statics"], "static"), (["static", "--laws", "jazz"], "jazz"), (["static", "--stiffness", "0"], "stiffness"),
-     (["properties", "--stability.poses", "0"], "poses"), (["transient", "--num-envs", "0"], "num_envs"),
-     (["static", "--output", "FILE"], "FILE")],
+     (["properties", "--stability.poses", "0"], "poses"), (["properties", "--load", "0"], "load"),
+     (["properties", "--settle-seconds", "0.5"], "settle_seconds"), (["properties", "--robot", "h2"], "h2"),
+     (["transient", "--num-envs", "0"], "num_envs"), (["static", "--output", "FILE"], "FILE")],
 )  # fmt: skip
 def test_bad_input_is_named(arguments, message, capsys, tmp_path):
     (tmp_path / "FILE").touch()
