@@ -129,9 +129,10 @@ def main() -> int:
         require_range("threads", options.threads, 0, 4096)
         if options.threads:
             torch.set_num_threads(options.threads)
-        results = {str(n): measure(n, options) for n in options.sizes}
         if options.json:
             options.json.parent.mkdir(parents=True, exist_ok=True)
+        results = {str(n): measure(n, options) for n in options.sizes}
+        if options.json:
             write_json(options.json, {"sizes": results, "threads": options.threads, "machine": machine()})
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)

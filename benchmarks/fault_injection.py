@@ -35,6 +35,7 @@ from cotap.agents.dual_ppo import DualPPO
 from cotap.agents.runner import CHECKPOINT_PATTERN, newest_checkpoint
 from cotap.envs import HumanoidEnv
 from cotap.envs.external_forces import ExternalForces
+from cotap.files import require_output
 
 ITERATIONS, INTERVAL, STEPS, ENVS, SICK = 12, 2, 4, 16, 3
 """Of every training: iterations, iterations between saves, steps per iteration, envs, and the env that is hurt."""
@@ -522,6 +523,10 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0, help="of the moments at which it is killed")
     parser.add_argument("--json", type=Path, help="write the table here")
     options = parser.parse_args()
+    try:
+        require_output("--json", options.json or "")
+    except (ValueError, OSError) as error:
+        parser.error(str(error))
     with tempfile.TemporaryDirectory(prefix="cotap-faults-") as work:
         rows = inject(options.kills, Path(work), options.seed)
     print(f"{ENVS} envs, {ITERATIONS} iterations, a save every {INTERVAL}\n\n{table(rows)}")

@@ -24,6 +24,7 @@ from cotap.agents.ranks import Ranks
 from cotap.agents.runner import DualRunner
 from cotap.configs import BASE_RECIPES, to_plain
 from cotap.envs import HumanoidEnv
+from cotap.files import require_output
 
 LEARNING = ("command/error_velocity", "episode/falls_per_s", "command/e_upper", "curriculum/assist")
 RATE = "throughput/steps_per_s"
@@ -139,13 +140,23 @@ def _count_in(rank: int, size: int, port: int, work: str) -> None:
         (Path(work) / "counts.json").write_text(json.dumps(result))
 
 
+def layout(text: str) -> tuple[int, int]:
+    """Processes and threads of each, of `PROCESSESxTHREADS`."""
+    processes, _, threads = text.partition("x")
+    if not (processes.isdecimal() and threads.isdecimal() and int(processes) and int(threads)):
+        raise argparse.ArgumentTypeError(f"must be PROCESSESxTHREADS, got {text!r}")
+    return int(processes), int(threads)
+
+
 def main() -> int:
     """Returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("count", help="messages and bytes per iteration")
     measuring = commands.add_parser("measure", help="throughput and learning of processes x threads")
-    measuring.add_argument("--layouts", nargs="+", default=["1x2", "2x1", "1x1"], help="PROCESSESxTHREADS each")
+    measuring.add_argument(
+        "--layouts", nargs="+", type=layout, default=[(1, 2), (2, 1), (1, 1)], help="PROCESSESxTHREADS each"
+    )
     measuring.add_argument("--envs", type=int, default=1024, help="in all")
     measuring.add_argument("--iterations", type=int, default=60)
     measuring.add_argument("--seeds", type=int, default=3)
@@ -154,8 +165,11 @@ def main() -> int:
     if options.command == "count":
         print(json.dumps(count(), indent=2))
         return 0
-    layouts = [(int(k), int(t)) for k, _, t in (layout.partition("x") for layout in options.layouts)]
-    rows = measure(layouts, options.envs, options.iterations, options.seeds)
+    try:
+        require_output("--json", options.json or "")
+    except (ValueError, OSError) as error:
+        parser.error(str(error))
+    rows = measure(options.layouts, options.envs, options.iterations, options.seeds)
     print(f"{options.envs} envs, {options.iterations} iterations, {options.seeds} seeds\n\n{table(rows)}")
     if options.json:
         options.json.write_text(json.dumps(rows, indent=2) + "\n")

@@ -23,7 +23,8 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
-from cotap.evaluation.report import pyplot
+from cotap.evaluation.report import pyplot, save_figure
+from cotap.files import require_output
 
 FOREVER = 10**9
 RATE = "throughput/steps_per_s"
@@ -161,7 +162,7 @@ def plot(path: Path, soaked: Soaked) -> None:
     for axis in axes:
         axis.set_ylim(bottom=0.0)
         axis.grid(alpha=0.3)
-    figure.savefig(path, dpi=120)
+    save_figure(figure, path)
 
 
 def main() -> int:
@@ -179,6 +180,11 @@ def main() -> int:
     parser.add_argument("--plot", type=Path, help="write the plot here (PNG)")
     parser.add_argument("options", nargs="*", help="options of the training, after --")
     options = parser.parse_args()
+    try:
+        require_output("--json", options.json or "")
+        require_output("--plot", options.plot or "", (".png",))
+    except (ValueError, OSError) as error:
+        parser.error(str(error))
     with tempfile.TemporaryDirectory(prefix="cotap-soak-") as work:
         soaked = soak(
             options.run_dir or Path(work) / "run", Path(work) / "log", options.stage, 60.0 * options.minutes,

@@ -1,11 +1,13 @@
-"""benchmarks.training: its parts run, step after step, and do what they are to time."""
+"""Benchmarks: parts of `training` run and do what they are to time; bad input is refused before the work."""
 
 from __future__ import annotations
+
+import sys
 
 import pytest
 import torch
 
-from benchmarks import training
+from benchmarks import fault_injection, scaling, soak, training
 from cotap.compliance.laws import LAWS
 
 
@@ -33,3 +35,20 @@ def test_stores_that_are_timed_hold_changes_back():
     assert 0.01 < part.held / part.step < 0.5
     spread = part.stiffness.amax(0) / part.stiffness.amin(0)
     torch.testing.assert_close(spread, torch.full_like(spread, 16.0), rtol=0.05, atol=0)
+
+
+@pytest.mark.parametrize(("module", "arguments"), [(fault_injection, []), (scaling, ["measure"]), (soak, [])])
+def test_a_file_that_cannot_be_written_is_refused_before_the_work(module, arguments, monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(sys, "argv", ["it", *arguments, "--json", str(tmp_path / "nowhere" / "result.json")])
+    with pytest.raises(SystemExit, match="2"):
+        module.main()
+    assert "its folder does not exist" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("text", ["2", "0x1", "1x0", "1x-1", "x", "1x2x3"])
+def test_layouts_that_are_none_are_refused(text, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["it", "measure", "--layouts", "2x1", text])
+    with pytest.raises(SystemExit, match="2"):
+        scaling.main()
+    assert "must be PROCESSESxTHREADS, got" in capsys.readouterr().err
+    assert scaling.layout("2x11") == (2, 11)
