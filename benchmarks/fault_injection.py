@@ -510,7 +510,8 @@ def table(rows: list[Row]) -> str:
     lines = ["| fault | injected | survived | most lost [iterations] | outcome |", "|---|---|---|---|---|"]
     for r in rows:
         lost = "-" if r.most_lost is None else r.most_lost
-        lines.append(f"| {r.fault} | {r.injected} | {r.survived} | {lost} | {r.outcome} |")
+        outcome = r.outcome if r.survived == r.injected else "not as it should be"
+        lines.append(f"| {r.fault} | {r.injected} | {r.survived} | {lost} | {outcome} |")
     return "\n".join(lines)
 
 

@@ -52,3 +52,9 @@ def test_layouts_that_are_none_are_refused(text, monkeypatch, capsys):
         scaling.main()
     assert "must be PROCESSESxTHREADS, got" in capsys.readouterr().err
     assert scaling.layout("2x11") == (2, 11)
+
+
+def test_what_was_not_survived_is_not_called_so():
+    good, bad = (fault_injection.Row("a fault", 2, survived, 0, "ends equal") for survived in (2, 1))
+    assert "| 2 | 2 | 0 | ends equal |" in fault_injection.table([good])
+    assert "| 2 | 1 | 0 | not as it should be |" in fault_injection.table([bad])
