@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from cotap.compliance import modulate_stiffness
-from cotap.evaluation.report import pyplot
+from cotap.evaluation.report import pyplot, save_figure
 
 STEPS = 7
 
@@ -45,7 +45,7 @@ def main() -> int:
             axis.text(2.3 * i, -1.45, f"$\\alpha$ = {t:.2f}\ndet {float(torch.det(k)):.2f}", ha="center", fontsize=8)
         axis.set(title=title, aspect="equal", ylim=(-1.9, 1.1))
         axis.axis("off")
-    figure.savefig(path, dpi=130)
+    save_figure(figure, path)
     return 0
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from cotap.compliance import EnergyStore, damping_energy, hold_back, spd_exp, spd_log, stiffness_energy
-from cotap.evaluation.report import pyplot
+from cotap.evaluation.report import pyplot, save_figure
 
 DT, SECONDS, SUBSTEPS = 0.02, 4.0, 20
 MASS_KG, DAMPING, SOFT, STIFF = 1.0, 2.0, 100.0, 600.0
@@ -101,7 +101,7 @@ def main() -> int:
 
     figure, axes = plt.subplots(1, 3, figsize=(12.0, 3.2), constrained_layout=True)
     draw(axes)
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path)
     return 0
 
 

@@ -48,7 +48,7 @@ def main(argv: list[str] | None = None) -> int:
         result["seconds"] = time.perf_counter() - started
         write_json(output / "report.json", result)
         write_atomically(output / "report.md", lambda p: p.write_text(markdown(result), encoding="utf-8"))
-        write_atomically(output / "report.png", lambda p: figure(result, p))
+        figure(result, output / "report.png")
     except (ValueError, OSError, ModuleNotFoundError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -331,7 +331,13 @@ def test_the_figure_draws_errors_from_the_onset_on_and_torques_about_statics(tmp
     np.testing.assert_allclose(drawn, [[0.0, 2.0], [-6.0] * 2, [8.0] * 2, [1.0, 3.0], [-3.0] * 2, [7.0] * 2])
     assert (tmp_path / "x.png").read_bytes().startswith(b"\x89PNG")
     assert periodic_load.get_ylim() == (-13.0, 17.0)
-    close(kept[0])
+    right["elbow_torque_statics_nm"] = 40.0  # of a stronger robot
+    figure(result, tmp_path / "x.png")
+    low, high = kept[1].axes[2].get_ylim()
+    assert low < -39.0
+    assert high > 41.0
+    for drawn in kept:
+        close(drawn)
 
 
 @pytest.mark.slow

@@ -33,7 +33,7 @@ from cotap.evaluation.law_options import parse_law
 from cotap.evaluation.metrics import summarize, tracking_measures, wilson_interval
 from cotap.evaluation.periodic import amplitude as swing_amplitude
 from cotap.evaluation.periodic import elbow_joints
-from cotap.evaluation.report import pyplot
+from cotap.evaluation.report import pyplot, save_figure
 from cotap.motions.elbow import elbow_index
 from cotap.motions.reference import HELD, MIXTURE
 from cotap.robots import RobotSpec
@@ -323,7 +323,7 @@ def _falls(row: dict[str, Any]) -> str:
     return f"{row['falls']} of {row['trials']} ({100 * low:.0f} to {100 * high:.0f} %)"
 
 
-def figure(result: dict[str, Any], path: Any) -> None:
+def figure(result: dict[str, Any], path: Path) -> None:
     """Impact, constant load and periodic load over time, and falls under perturbations, as a picture."""
     plt = pyplot()
 
@@ -343,9 +343,9 @@ def figure(result: dict[str, Any], path: Any) -> None:
             for end in (-1.0, 1.0) if torque else ():
                 axis.axhline(np.mean(torque) + end * statics, color="0.4", ls=":", lw=1.0)
         axis.set(title=f"{name}, periodic load; dotted: statics", xlabel="time [s]", ylabel="elbow torque [Nm]")
-        axis.set_ylim(-13.0, 17.0)
+        low, high = axis.get_ylim()
+        axis.set_ylim(min(low, -13.0), max(high, 17.0))
         axis.legend(frameon=False, fontsize=9, loc="upper right")
         for axis in column:
             axis.grid(alpha=0.2)
-    fig.savefig(path, dpi=130, format="png")
-    plt.close(fig)
+    save_figure(fig, path)
