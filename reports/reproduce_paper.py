@@ -45,12 +45,12 @@ PARTS: dict[str, Callable[[Book], None]] = {
     "pictures": pictures,
 }
 HEAD = """Written by `{command}`: do not edit. {envs} envs a row unless said otherwise. Means are over the envs that
-stood
-unless said otherwise; after ± stands the larger half of the bootstrap's 95 % interval. Shares of falls are over
-all envs, from the start to the end of the episode, with Wilson's interval in brackets. Arms that move play
-clips half of the time and generated motion otherwise. One training stands behind each policy unless said
-otherwise: intervals are over envs, not over trainings. A difference between two rows is taken env by env, over
-those that stood in both; both begin with the same friction, masses, motion and direction of the push."""
+stood unless said otherwise; after ± stands the larger half of the 95 % interval, the bootstrap's or, of what happens or
+does not, Wilson's. Shares of falls [%] are over all envs, from the start to the end of the episode, with Wilson's
+interval in brackets. Arms that move play clips half of the time and generated motion otherwise. One training stands
+behind each policy unless said otherwise: intervals are over envs, not over trainings. A difference between two rows is
+taken env by env, over those that stood in both; both begin with the same friction, masses, motion and direction of the
+push."""
 IMPACT = """The impact is 500 N for 50 ms at the left hand, along x in stance, in a random horizontal direction while
 walking at 0.5 m/s, arms moving; measured for 1 s from its onset. Friction, masses, gains and delay are
 randomised, the torque limits are {robot}'s own. *K 100* is CoTaP at 100 N/m in x and y and 300 N/m in z, k_null 25
