@@ -36,8 +36,8 @@ WHY = """{paper} has a hand error in z of 0.05 m at K_z 500, where F / K is 0.10
 0.12 m at K_z 100, where ours goes {soft} m. F / K is 0.5 m there, more than an arm can reach. What may shorten the
 way: near an arm's end the ratio gives way to PD, stiffness acts on joint errors, which is exact for small displacements
 only, joints have torque limits, and the policy's own arm actions act, too. Under PD the paper's hand reverses
-(-0.03 m); at rest ours lies on the load's side ({pd} m). Ours first goes beyond its rest, by {pd_over} of the way under
-PD and {blend_over} at alpha 0.5."""
+(-0.03 m); ours rests {pd} m from where it was, negative on the load's side. On the way there ours goes beyond its rest
+by {pd_over} of the way under PD and {blend_over} at alpha 0.5."""
 
 
 def constant_load(book: Book) -> None:

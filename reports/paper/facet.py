@@ -6,7 +6,7 @@ from typing import Any
 
 from reports.paper.arms import NULL_STIFFNESS
 from reports.paper.book import Book, kept
-from reports.paper.words import NOT_MEASURED, missing, the_paper
+from reports.paper.words import missing, the_paper
 
 STATIC_ENVS, STRUCK_ENVS = 384, 256
 WHAT = """All laws at 500 N/m and k_null {null} Nm/rad, in stance, arms held, with the policy's own arm actions. {rows}
@@ -67,5 +67,4 @@ def measured(book: Book, name: str, table: Any, caption: str) -> dict[str, Any]:
 
 def moved(result: dict[str, Any], name: str) -> str:
     """How far down a row's hand goes under each load [m]."""
-    shown = ("-" if value is None else f"{value:.3f}" for value in result["rows"][name]["displacement"])
-    return " / ".join(shown) if name in result["rows"] else NOT_MEASURED
+    return " / ".join("-" if value is None else f"{value:.3f}" for value in result["rows"][name]["displacement"])
