@@ -159,4 +159,10 @@ def main(path: str) -> None:
 
 
 if __name__ == "__main__":
-    check(sys.argv[2]) if sys.argv[1] == "--check" else main(sys.argv[1])
+    match sys.argv[1:]:
+        case ["--check", path]:
+            check(path)
+        case [path] if path != "--check":
+            main(path)
+        case _:
+            sys.exit(__doc__)

@@ -117,3 +117,10 @@ def test_it_refuses_arms_under_another_law(policy_file, example, tmp_path):
     onnx.save(proto, tmp_path / "p.onnx")
     with pytest.raises(ValueError, match="PD arms only"):
         example.PolicyRunner(str(tmp_path / "p.onnx"))
+
+
+@pytest.mark.parametrize("arguments", [[], ["--check"], ["a.onnx", "b.onnx"]])
+def test_without_a_file_it_says_how_it_is_used(arguments):
+    done = subprocess.run([sys.executable, str(EXAMPLE), *arguments], capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr.startswith("A robot's loop around an exported policy")
