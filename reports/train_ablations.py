@@ -2,8 +2,9 @@
 
 python -m reports.train_ablations --run-dir runs/ablations --base-checkpoint h1-base
 
-All else is an option of `cotap train distill` and holds for all of them, such as --iterations. The same command goes on
-where it stopped, and says at the end how the paper's tables are made of them.
+All else is an option of `cotap train distill` and holds for all of them, such as --iterations, but that each has its
+recipe, and each seed its seed. The same command goes on where it stopped, and says at the end how the paper's tables
+are made of them.
 """
 
 from __future__ import annotations
@@ -20,9 +21,7 @@ from cotap.pipeline import Stopped
 from cotap.train import run_stage
 
 TRAININGS: dict[str, list[str]] = {
-    "seed-0": ["--recipe", "short"],
-    "seed-1": ["--recipe", "short", "--seed", "1"],
-    "seed-2": ["--recipe", "short", "--seed", "2"],
+    **{f"seed-{seed}": ["--recipe", "short", "--seed", str(seed)] for seed in range(3)},
     **{name: ["--recipe", name] for name in ("no-ratio", "torque-critic", "goals", "facet")},
 }
 """By the policy's name in `reports.reproduce_paper`."""
@@ -36,7 +35,7 @@ def train(name: str, run_dir: Path, options: list[str]) -> Path:
         ValueError: an option of `cotap train distill` is not valid.
     """
     folder = run_dir / name
-    run_stage("distill", [*TRAININGS[name], *options, "--run-dir", str(folder), "--resume", "auto"])
+    run_stage("distill", [*options, *TRAININGS[name], "--run-dir", str(folder), "--resume", "auto"])  # the last counts
     newest = newest_checkpoint(folder)
     assert newest, f"{folder} holds no checkpoint of a training that ended"
     content = load_checkpoint(newest)

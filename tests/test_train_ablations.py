@@ -38,13 +38,22 @@ def test_each_has_a_row_in_the_tables_and_a_recipe():
 
 def test_all_are_trained_and_the_next_command_names_them(asked, tmp_path, capsys):
     assert main(["--run-dir", str(tmp_path), "--iterations", "3", "--threads", "1"]) == 0
-    assert [args[: len(begin)] for args, begin in zip(asked, TRAININGS.values(), strict=True)] == [*TRAININGS.values()]
-    for name, args in zip(TRAININGS, asked, strict=True):
-        rest = ["--iterations", "3", "--threads", "1", "--run-dir", str(tmp_path / name), "--resume", "auto"]
-        assert args[len(TRAININGS[name]) :] == rest
+    for (name, own), args in zip(TRAININGS.items(), asked, strict=True):
+        given, rest = ["--iterations", "3", "--threads", "1"], ["--run-dir", str(tmp_path / name), "--resume", "auto"]
+        assert args == [*given, *own, *rest]
     said = capsys.readouterr().out
     assert f"--robot g1 --policies seed-0={tmp_path}/seed-0/checkpoint_000003.pt" in said
     assert f" facet={tmp_path}/facet/checkpoint_000003.pt\n" in said
+
+
+def test_what_they_differ_in_is_not_overridden(asked, tmp_path):
+    """Of an option given twice, the last counts; a seed is named, for that of the base is the default."""
+    main(["--run-dir", str(tmp_path), "--iterations", "3", "--recipe", "default", "--seed", "1"])
+    last = {name: {o: args[len(args) - args[::-1].index(o)] for o in ("--recipe", "--seed")}
+            for name, args in zip(TRAININGS, asked, strict=True)}  # fmt: skip
+    assert [last[f"seed-{seed}"]["--seed"] for seed in range(3)] == ["0", "1", "2"]
+    assert {last[f"seed-{seed}"]["--recipe"] for seed in range(3)} == {"short"}
+    assert all(last[name]["--recipe"] == name for name in ("no-ratio", "torque-critic", "goals", "facet"))
 
 
 def test_one_that_is_stopped_ends_it(asked, tmp_path, capsys):
