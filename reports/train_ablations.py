@@ -52,7 +52,10 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("--run-dir", type=Path, default=Path("runs/ablations"), help="gets a folder for each of them")
     parser.add_argument("--only", nargs="+", default=list(TRAININGS), metavar="NAME", help=", ".join(TRAININGS))
+    parser.add_argument("--base-checkpoint", default="", help="what all begin from; by default the shipped base")
     own, options = parser.parse_known_args(argv)
+    base = own.base_checkpoint
+    options += ["--base-checkpoint", base] if base else []
     try:
         for name in own.only:
             require_one_of("--only", name, TRAININGS.keys())
@@ -64,7 +67,8 @@ def main(argv: list[str] | None = None) -> int:
         print(stop, file=sys.stderr)
         return 130
     robot = load_checkpoint(next(iter(last.values())))["layout"]["robot"]
-    policies = [f"{name}={path}" for name, path in last.items()]
+    named = ({"base": base} if base else {}) | last
+    policies = [f"{name}={path}" for name, path in named.items()]
     tables = ["python", "-m", "reports.reproduce_paper", "--robot", robot, "--policies", *policies]
     print("\nNext:\n  " + shlex.join(tables))
     return 0

@@ -56,6 +56,12 @@ def test_what_they_differ_in_is_not_overridden(asked, tmp_path):
     assert all(last[name]["--recipe"] == name for name in ("no-ratio", "torque-critic", "goals", "facet"))
 
 
+def test_the_tables_have_the_base_that_all_began_from(asked, tmp_path, capsys):
+    assert main(["--run-dir", str(tmp_path), "--iterations", "3", "--base-checkpoint", "b.pt", "--only", "goals"]) == 0
+    assert asked[0][asked[0].index("--base-checkpoint") + 1] == "b.pt"
+    assert f"--policies base=b.pt goals={tmp_path}/goals/" in capsys.readouterr().out
+
+
 def test_one_that_is_stopped_ends_it(asked, tmp_path, capsys):
     assert main(["--run-dir", str(tmp_path), "--only", "goals", "facet", "--iterations", "4"]) == 130
     assert len(asked) == 1
