@@ -94,7 +94,7 @@ def _count_in(rank: int, size: int, port: int, work: str) -> None:
     os.environ.update(MASTER_ADDR="127.0.0.1", MASTER_PORT=str(port))
     torch.set_num_threads(1)
     training = BASE_RECIPES["default"]()
-    training.env.num_envs, training.env.num_threads = 8, 1
+    training.env.num_envs, training.env.num_threads, training.runner.iterations = 8, 1, 2
     ranks = Ranks(rank, size, rank, size)
     messages: Counter[str] = Counter()
     total: Counter[str] = Counter()
@@ -127,7 +127,7 @@ def _count_in(rank: int, size: int, port: int, work: str) -> None:
 
         runner.alg.act, runner._iterate = watched, begun
         dist.all_reduce = counted
-        runner.learn(2)  # from the beginning of the first to that of the second is one iteration, whole
+        runner.learn()  # from the beginning of the first to that of the second is one iteration, whole
         dist.all_reduce = all_reduce
     if rank == 0:
         weights = {

@@ -58,3 +58,10 @@ def test_what_was_not_survived_is_not_called_so():
     good, bad = (fault_injection.Row("a fault", 2, survived, 0, "ends equal") for survived in (2, 1))
     assert "| 2 | 2 | 0 | ends equal |" in fault_injection.table([good])
     assert "| 2 | 1 | 0 | not as it should be |" in fault_injection.table([bad])
+
+
+@pytest.mark.slow
+def test_messages_of_two_processes_are_counted():
+    counted = scaling.count()
+    assert counted["messages"].keys() == counted["bytes"].keys() == {"gradients", "normalisers", "scalars"}
+    assert counted["bytes"]["gradients"] > 4 * sum(counted["weights"].values())  # of all weights, in float32
