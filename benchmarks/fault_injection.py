@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import ctypes
-import json
 import math
 import os
 import random
@@ -30,7 +29,7 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from cotap import train
-from cotap.agents.checkpoint import load_checkpoint
+from cotap.agents.checkpoint import load_checkpoint, write_json
 from cotap.agents.dual_ppo import DualPPO
 from cotap.agents.runner import CHECKPOINT_PATTERN, newest_checkpoint
 from cotap.envs import HumanoidEnv
@@ -532,7 +531,7 @@ def main() -> int:
         rows = inject(options.kills, Path(work), options.seed)
     print(f"{ENVS} envs, {ITERATIONS} iterations, a save every {INTERVAL}\n\n{table(rows)}")
     if options.json:
-        options.json.write_text(json.dumps([asdict(r) for r in rows], indent=2) + "\n")
+        write_json(options.json, [asdict(r) for r in rows])
     return int(any(r.survived < r.injected for r in rows))
 
 

@@ -20,6 +20,7 @@ import torch.distributed as dist
 import torch.multiprocessing as mp
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from cotap.agents.checkpoint import write_json
 from cotap.agents.ranks import Ranks
 from cotap.agents.runner import DualRunner
 from cotap.configs import BASE_RECIPES, to_plain
@@ -172,7 +173,7 @@ def main() -> int:
     rows = measure(options.layouts, options.envs, options.iterations, options.seeds)
     print(f"{options.envs} envs, {options.iterations} iterations, {options.seeds} seeds\n\n{table(rows)}")
     if options.json:
-        options.json.write_text(json.dumps(rows, indent=2) + "\n")
+        write_json(options.json, rows)
     return 0
 
 

@@ -22,6 +22,7 @@ import numpy as np
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from cotap.agents.checkpoint import write_json
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.evaluation.report import pyplot, save_figure
 from cotap.files import require_output
@@ -205,7 +206,7 @@ def main() -> int:
     print(json.dumps(result, indent=2))
     if options.json:
         series = {name: getattr(soaked, name).tolist() for name in ("memory", "pauses", "rates")}
-        options.json.write_text(json.dumps(result | {"series": series}) + "\n")
+        write_json(options.json, result | {"series": series})
     if options.plot:
         plot(options.plot, soaked)
     return int(result["memory_growth"] > MOST_GROWTH or slower < -MOST_SLOWDOWN)

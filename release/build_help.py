@@ -22,6 +22,7 @@ from cotap.evaluate import PROTOCOLS, RECORDING, Options, RecordingOptions
 from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.recording import RecordingProtocol
 from cotap.export import ExportOptions
+from cotap.files import write_atomically
 from cotap.motions.__main__ import make_parser
 from cotap.pipeline import PipelineOptions
 from cotap.play.__main__ import PlayOptions
@@ -134,7 +135,8 @@ def _value(metavar: str) -> str:
 
 def main() -> int:
     """Write the file. Returns the exit status."""
-    FILE.write_text(dump_commands(build()), encoding="utf-8")
+    text = dump_commands(build())
+    write_atomically(FILE, lambda p: p.write_text(text, encoding="utf-8"))
     print(f"written: {FILE}")
     return 0
 
