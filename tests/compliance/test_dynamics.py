@@ -136,3 +136,17 @@ def test_damping_is_critical_where_stiffness_spans_four_decades(rng, n, dtype, a
 def test_critical_damping_by_hand():
     k, m = torch.diag(torch.tensor([100.0, 25.0])), torch.diag(torch.tensor([1.0, 0.25]))
     torch.testing.assert_close(critical_damping(k, m), torch.diag(torch.tensor([20.0, 5.0])))
+
+
+@pytest.mark.parametrize("n", [3, 4, 7])
+@pytest.mark.parametrize("least", [1e-7, 1e-8, 0.0])
+def test_damping_is_finite_where_stiffness_is_next_to_nothing_in_a_direction(rng, n, least):
+    """As that of an arm all but straight without the singularity's ratio: in single precision it may be negative."""
+    basis = torch.linalg.qr(torch.randn(5000, n, n, dtype=torch.float64, generator=rng))[0]
+    values = torch.cat((torch.full((5000, 1), least), torch.rand(5000, n - 1, generator=rng) + 0.1), 1).double()
+    k = 300.0 * (basis @ torch.diag_embed(values) @ basis.mT)
+    root = 0.2 * torch.randn(5000, n, n, dtype=torch.float64, generator=rng)
+    m = root @ root.mT + 0.05 * torch.eye(n)
+    d = critical_damping(k.float(), m.float()).double()
+    error = (0.25 * d @ torch.linalg.inv(m) @ d - k).abs().amax((1, 2)) / k.abs().amax((1, 2))
+    assert float(error.max()) < 0.02

@@ -118,5 +118,8 @@ def critical_damping(stiffness: torch.Tensor, inertia: torch.Tensor, ratio: floa
     k, m = batch_last(stiffness), batch_last(inertia)
     unit = m.diagonal().movedim(-1, 0).rsqrt()
     units = unit.unsqueeze(1) * unit  # in which every joint's own inertia is 1
-    mean = geometric_mean(k * units, m * units)
+    k = k * units
+    # What is next to nothing in a direction may be negative there by rounding.
+    k.diagonal().mul_(1.0 + 8.0 * torch.finfo(k.dtype).eps)
+    mean = geometric_mean(k, m * units)
     return (2.0 * ratio * mean / units).movedim(-1, 0).reshape(stiffness.shape)
