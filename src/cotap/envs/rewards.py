@@ -226,8 +226,9 @@ class LowerRewards:
 
     @term(-0.3)
     def roll_pitch_rate(s: StepRecord) -> torch.Tensor:
-        """Squared angular velocity of the torso about its horizontal axes."""
-        return s.state.torso_angular_velocity_t[:, :2].square().sum(1)
+        """Squared angular velocity of the torso about its horizontal axes, each up to 20 rad/s: one robot whose
+        simulation diverges would outweigh all others."""
+        return s.state.torso_angular_velocity_t[:, :2].clamp(-20.0, 20.0).square().sum(1)
 
     @term(5.0)
     def contact_schedule(s: StepRecord) -> torch.Tensor:
