@@ -231,6 +231,24 @@ def test_without_the_ratio_it_is_the_papers_law_up_to_a_straight_arm(rng):
     assert torch.isfinite(stiffness.pseudo_inverse).all()
 
 
+@pytest.mark.parametrize("joints", [4, 7])
+@pytest.mark.parametrize("smallest", [0.0, 1e-8, 1e-7, 1e-6, 4e-6, 1e-5])
+def test_without_a_direction_to_move_in_it_is_pd(joints: int, smallest: float, rng):
+    """Where rank is lost, to rounding or wholly, whatever the stiffness of each direction and alpha."""
+    u, s, v = torch.linalg.svd(torch.randn(2000, 3, joints, dtype=DOUBLE, generator=rng), full_matrices=False)
+    s[:, 2] = smallest * s[:, 0]
+    j, alpha = u @ torch.diag_embed(s) @ v, torch.rand(2000, dtype=DOUBLE, generator=rng)
+    task = torch.exp(torch.empty(2000, 3).double().uniform_(math.log(80.0), math.log(1200.0), generator=rng))
+    null, pd = torch.full_like(alpha, 40.0), torch.full_like(alpha, 100.0)
+    blend = blended_stiffness(j, task, null, pd, alpha)
+    torch.testing.assert_close(blend.stiffness, (100.0 * torch.eye(joints)).double().expand_as(blend.stiffness),
+                               rtol=0.0, atol=1.0)  # fmt: skip
+    paper = blended_stiffness(j, task, null, pd, alpha, math.inf)
+    values = torch.linalg.eigvalsh(paper.stiffness)  # the paper's law asks for next to nothing there
+    assert (values[:, 0] > -1e-6 * values[:, -1]).all()
+    assert torch.isfinite(paper.pseudo_inverse).all()
+
+
 @pytest.mark.parametrize("apart", [0.0, 2e-7, 1e-5, 0.03])
 def test_the_fast_blend_is_as_exact_where_eigenvalues_nearly_coincide(apart: float):
     """Of a Jacobian that is diagonal, so is the blend: `pd^(1-a) k^a` joint by joint."""

@@ -22,8 +22,8 @@ import torch
 from cotap.compliance.small_matrices import batch_last, eigenvalues_3x3, inverse_3x3, plus_diagonal, product
 from cotap.compliance.stiffness import RANK_TOLERANCE
 
-_ROUNDING = 1e-14
-"""Share of the largest eigenvalue below which one is taken for rounding."""
+_ROUNDING = 1e-11
+"""Share of the largest squared singular value below which the smallest is taken for rounding, more so the smaller."""
 
 
 @dataclass(frozen=True)
@@ -76,14 +76,14 @@ def blended_stiffness(
         squares = _squares(j)
     tolerance = 0.0 if math.isinf(threshold) else RANK_TOLERANCE
     missing = (tolerance**2 * squares[2].clamp_min(1e-12) - squares[0]).clamp_min(0.0)
-    pseudo_inverse, projector = _null_space(j, squares, missing)
+    pseudo_inverse, projector, kept = _null_space(j, squares, missing)
     # A direction that the arm can hardly move in is as stiff as the damped null space makes it.
     lost = missing / (squares[0].clamp_min(0.0) + missing + 1e-300) * null
     if task_stiffness.dim() == jacobian.dim():
         b = product(batch_last(torch.linalg.cholesky(task_stiffness.double()).mT), j)
     else:
         b = task_stiffness.double().sqrt().reshape(-1, 3).T.unsqueeze(1) * j
-    stiffness, spectrum = _power(b, projector, lost, null, pd.flatten(), ratio)
+    stiffness, spectrum = _power(b, projector, kept, lost, null, pd.flatten(), ratio)
     if root is not None:
         rows = root.unsqueeze(1)
         stiffness, pseudo_inverse, projector = rows * stiffness * root, pseudo_inverse / rows, projector / rows * root
@@ -103,32 +103,40 @@ def _condition(squares: torch.Tensor) -> torch.Tensor:
     return (largest / squares[0].clamp_min(1e-14 * largest)).sqrt()
 
 
-def _null_space(j: torch.Tensor, squares: torch.Tensor, missing: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def _null_space(
+    j: torch.Tensor, squares: torch.Tensor, missing: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Of Jacobians (3, n, B), the pseudo-inverse (n, 3, B), damped by what is `missing`, and the projector (n, n, B).
 
-    The projector itself is as exact as doubles allow: the rank that is lost is made up for in the power.
+    The projector itself is exact up to rounding: the rank that is lost is made up for in the power. Last, the share
+    (B,) of the direction of the smallest singular value that it leaves to the hand, 1 but for what is rounding.
     """
-    transposed, rounding = j.transpose(0, 1), _ROUNDING * squares[2].clamp_min(1e-12)
-    gram = product(j, transposed)
-    damped, exact = (inverse_3x3(plus_diagonal(gram, shift)) for shift in (missing.maximum(rounding), rounding))
+    transposed, gram = j.transpose(0, 1), product(j, j.transpose(0, 1))
+    smallest, least = squares[0].clamp_min(0.0), _ROUNDING * squares[2].clamp_min(1e-12)
+    shift = (least - smallest).clamp_min(0.0)
+    damped, exact = (inverse_3x3(plus_diagonal(gram, x)) for x in (missing.maximum(shift), shift))
     of_hand = product(transposed, product(exact, j))
-    return product(transposed, damped), plus_diagonal(-of_hand, torch.ones_like(rounding))
+    projector = plus_diagonal(-of_hand, torch.ones_like(shift))
+    return product(transposed, damped), projector, smallest / smallest.maximum(least)
 
 
 def _power(
-    b: torch.Tensor, projector: torch.Tensor, lost: torch.Tensor, null: torch.Tensor, pd: torch.Tensor,
-    ratio: torch.Tensor,
+    b: torch.Tensor, projector: torch.Tensor, kept: torch.Tensor, lost: torch.Tensor, null: torch.Tensor,
+    pd: torch.Tensor, ratio: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
     """`pd^(1-a) (B^T G^(a-1) B + null^a N)`, (n, n, B), for a `ratio` a, and its outermost eigenvalues (2, B).
 
-    `lost` is what the damped null space adds to the smallest eigenvalue of G.
+    `kept` is the share of the direction of the smallest eigenvalue of G that is not N's, `lost` what the damped null
+    space adds to that eigenvalue.
     """
     inner = product(b, b.transpose(0, 1))
     values = eigenvalues_3x3(inner)
-    values = values.maximum(_ROUNDING * values[2].clamp_min(1e-12))
+    values = values.maximum(1e-14 * values[2].clamp_min(1e-12))
     stiff = torch.stack((values[0] + lost, values[1], values[2])).pow(ratio)
     scale, of_null = pd.pow(1.0 - ratio), null.pow(ratio)
-    task = product(b.transpose(0, 1), product(_through(inner, values, stiff / values, ratio - 1.0), b))
+    images = stiff / values
+    images[0] *= kept
+    task = product(b.transpose(0, 1), product(_through(inner, values, images, ratio - 1.0), b))
     stiffness = scale * (task + of_null * projector)
     return stiffness, scale * torch.stack((torch.minimum(stiff[0], of_null), torch.maximum(stiff[2], of_null)))
 
