@@ -15,11 +15,10 @@ CALM = ["--force", "0", "0", "0"]
 """Of an impact: none."""
 
 
-def cotap(x: float, y: float, z: float, alpha: float | None = None) -> list[str]:
+def cotap(x: float, y: float, z: float, alpha: float = 1.0) -> list[str]:
     """CoTaP at a stiffness of the hand along x, y and z [N/m]."""
-    blend = [] if alpha is None else ["--alpha", f"{alpha:g}"]
-    stiffness = [f"{value:g}" for value in (x, y, z)]
-    return ["--method", "cotap", "--stiffness", *stiffness, "--null-stiffness", NULL_STIFFNESS, *blend]
+    stiffness = ["--stiffness", *(f"{value:g}" for value in (x, y, z))]
+    return ["--method", "cotap", *stiffness, "--null-stiffness", NULL_STIFFNESS, "--alpha", f"{alpha:g}"]
 
 
 def arms(robot: str) -> dict[str, list[str]]:
