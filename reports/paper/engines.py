@@ -172,16 +172,16 @@ def tracking(trials: list[Trial], policy: OnnxPolicy, cfg: Comparison) -> dict[s
 
 def laws_by_part(robot: str) -> dict[str, dict[str, str]]:
     """Laws that impact and constant load compare, by name: those of the paper's Table III and Fig. 4."""
-    null = f"null_stiffness={NULL_STIFFNESS}"
-    struck = {f"K {k}": f"cotap:stiffness={k}x{k}x300,{null}" for k in (100, 500, 800)}
-    loaded = {f"K_z {k}": f"cotap:stiffness=300x300x{k},{null}" for k in (100, 500, 1000)}
+    struck = {f"K {k}": _cotap(k, k, 300) for k in (100, 500, 800)} | {"alpha 0.7, K 100": _cotap(100, 100, 300, 0.7)}
+    loaded = {f"K_z {k}": _cotap(300, 300, k) for k in (100, 500, 1000)} | {"alpha 0.5": _cotap(300, 300, 100, 0.5)}
     return {
-        "impact": {
-            "PD": "pd", "soft PD": f"soft-pd:soft_gain={soft_gain(robot):g}", **struck,
-            "alpha 0.7, K 100": f"{struck['K 100']},alpha=0.7",
-        },
-        "constant-load": {"PD": "pd", **loaded, "alpha 0.5": f"{loaded['K_z 100']},alpha=0.5"},
-    }  # fmt: skip
+        "impact": {"PD": "pd", "soft PD": f"soft-pd:soft_gain={soft_gain(robot):g}", **struck},
+        "constant-load": {"PD": "pd", **loaded},
+    }
+
+
+def _cotap(x: float, y: float, z: float, alpha: float = 1.0) -> str:
+    return f"cotap:stiffness={x}x{y}x{z},null_stiffness={NULL_STIFFNESS},alpha={alpha:g}"
 
 
 def loads(
