@@ -66,17 +66,19 @@ def blended_stiffness(
             is not made up for: the paper's law without its ratio.
     """
     j = batch_last(jacobian.double())
-    squares = _squares(j)
+    gram = product(j, j.transpose(0, 1))
+    squares = eigenvalues_3x3(gram)
     singularity = 1.0 / (1.0 + (_condition(squares) - threshold).clamp_min(0.0))
     ratio, null = alpha.double().flatten() * singularity, null_stiffness.double().flatten()
     pd, root = pd_stiffness.double(), None
     if pd.dim() == jacobian.dim() - 1:
         root = (pd / pd.amax(-1, keepdim=True)).sqrt().reshape(-1, pd.shape[-1]).T.contiguous()
         pd, j = pd.amax(-1), j / root
-        squares = _squares(j)
+        gram = product(j, j.transpose(0, 1))
+        squares = eigenvalues_3x3(gram)
     tolerance = 0.0 if math.isinf(threshold) else RANK_TOLERANCE
     missing = (tolerance**2 * squares[2].clamp_min(1e-12) - squares[0]).clamp_min(0.0)
-    pseudo_inverse, projector, kept = _null_space(j, squares, missing)
+    pseudo_inverse, projector, kept = _null_space(j, gram, squares, missing)
     # A direction that the arm can hardly move in is as stiff as the damped null space makes it.
     lost = missing / (squares[0].clamp_min(0.0) + missing + 1e-300) * null
     if task_stiffness.dim() == jacobian.dim():
@@ -92,11 +94,6 @@ def blended_stiffness(
     return ArmStiffness(*(x.to(jacobian.dtype).movedim(-1, 0).reshape(shape + x.shape[:-1]) for x in values))
 
 
-def _squares(j: torch.Tensor) -> torch.Tensor:
-    """Squared singular values (3, B), ascending, of Jacobians (3, n, B)."""
-    return eigenvalues_3x3(product(j, j.transpose(0, 1)))
-
-
 def _condition(squares: torch.Tensor) -> torch.Tensor:
     """Condition number (B,) of a Jacobian, of its squared singular values (3, B)."""
     largest = squares[2].clamp_min(1e-12)
@@ -104,14 +101,15 @@ def _condition(squares: torch.Tensor) -> torch.Tensor:
 
 
 def _null_space(
-    j: torch.Tensor, squares: torch.Tensor, missing: torch.Tensor
+    j: torch.Tensor, gram: torch.Tensor, squares: torch.Tensor, missing: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Of Jacobians (3, n, B), the pseudo-inverse (n, 3, B), damped by what is `missing`, and the projector (n, n, B).
+    """Of Jacobians (3, n, B) with `gram` J J^T: the pseudo-inverse (n, 3, B), damped by what is `missing`, and the
+    projector (n, n, B) on their null space.
 
     The projector itself is exact up to rounding: the rank that is lost is made up for in the power. Last, the share
     (B,) of the direction of the smallest singular value that it leaves to the hand, 1 but for what is rounding.
     """
-    transposed, gram = j.transpose(0, 1), product(j, j.transpose(0, 1))
+    transposed = j.transpose(0, 1)
     smallest, least = squares[0].clamp_min(0.0), _ROUNDING * squares[2].clamp_min(1e-12)
     shift = (least - smallest).clamp_min(0.0)
     damped, exact = (inverse_3x3(plus_diagonal(gram, x)) for x in (missing.maximum(shift), shift))
