@@ -127,7 +127,7 @@ def test_what_is_better_is_said(measure, b, shown, b_is):
 def test_every_measure_that_is_written_has_a_direction_or_has_none_on_purpose():
     shipped = shipped_checkpoint(shipped_names()[0]).parent
     measures = {name for file in shipped.glob("*.*.json") for name in json.loads(file.read_text())["metrics"]}
-    neither = {"j_upper", "j_upper_blow", "peak_torque", "energy", "swing_height", "stride_rate", "displacement_x",
+    neither = {"j_upper", "j_upper_push", "peak_torque", "energy", "swing_height", "stride_rate", "displacement_x",
                "displacement_y", "displacement_z", "condition_number", "singular_share", "null_share"}  # fmt: skip
     assert {name for name in measures if not better(name)} <= neither
     assert len(measures) > 15

@@ -121,7 +121,7 @@ def stance(book: Book) -> None:
         STANCE,
         paper=the_paper(book),
         second=of(book, pd, "j_upper", 1),
-        early=of(book, pd, "j_upper_blow", 1),
+        early=of(book, pd, "j_upper_push", 1),
         calm=of(book, "calm-cotap", "j_upper", 1),
         torso=change(book, pd, k100, "e_torso"),
         fell=fell(book, k100),
@@ -160,7 +160,7 @@ def orderings(book: Book) -> None:
     book.add("", "### The paper's orderings")
     book.table(f"ordering of the {book.paper}", *MODES, *(f"{mode}, first 0.1 s" for mode in MODES))
     for measure, smaller, larger in ORDERINGS:
-        windows = ("j_upper", "j_upper_blow") if measure == "j_upper" else (measure,)
+        windows = ("j_upper", "j_upper_push") if measure == "j_upper" else (measure,)
         found = (
             verdict(book, key(mode, smaller), key(mode, larger), shown, DIGITS.get(shown, 3))
             for shown in windows

@@ -13,10 +13,10 @@ LABELS = {
     "e_ee": "e_ee [m]",
     "e_ee_hit": "e_ee of the hand that is hit [m]",
     "j_upper": "J_upper [Nm]",
-    "j_upper_blow": "J_upper, first 0.1 s [Nm]",
+    "j_upper_push": "J_upper, first 0.1 s [Nm]",
 }
 """Measures of an impact, with their units."""
-DIGITS = {"j_upper": 1, "j_upper_blow": 1}
+DIGITS = {"j_upper": 1, "j_upper_push": 1}
 """Digits of a measure, where they are not three."""
 ALL_THREE = ("e_torso", "e_ee", "j_upper")
 """The measures of the paper's Table III."""

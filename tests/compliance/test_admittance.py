@@ -178,7 +178,7 @@ def test_envs_that_begin_anew_forget(arms):
 
 
 def test_references_move_no_faster_than_joints_can(arms):
-    """A blow of 500 N, at once over stiffness 5 m: the reference starts on its way at the joints' velocity limits."""
+    """A push of 500 N, at once over stiffness 5 m: the reference starts on its way at the joints' velocity limits."""
     law = AdmittanceLaw(arms, StaticShift(), PDLaw(arms))
     hit = a_state(arms, hand_force_h=torch.tensor([500.0, 0.0, 0.0]).expand(3, 2, 3))
     torque, _ = law(hit, parameters(stiffness=100.0))

@@ -417,11 +417,11 @@ def test_a_store_is_carried_from_law_to_law_and_never_refilled_by_it(make_env):
 
 def test_a_default_store_changes_nothing_where_nothing_is_commanded(make_env, robot):
     """To the last bit, while arms follow their motions and hands are pushed: only the pose changes the stiffness."""
-    blow = ForceProfile((5.0, -5.0, -10.0), "both", 0.1, 0.3)
+    push = ForceProfile((5.0, -5.0, -10.0), "both", 0.1, 0.3)
     runs = []
     for passive in (False, True):
         laws = both(LawConfig("cotap", passive=passive))
-        env = make_env(4, robot=robot, upper_body=laws, forces=loaded(blow), fixed_base=True)
+        env = make_env(4, robot=robot, upper_body=laws, forces=loaded(push), fixed_base=True)
         runs.append(drive(env, 30))
     assert float(env.upper_body.report["store_energy"].min()) < 2.0  # the pose does change it
     for plain, held in zip(*runs, strict=True):

@@ -234,7 +234,7 @@ def test_statics_asks_for_the_torque_that_holds_the_load():
     assert float(t.arm_static_torque[-1].abs().max()) > 2.0
 
 
-def test_a_blow_moves_the_hand_that_it_hits():
+def test_a_push_moves_the_hand_that_it_hits():
     push = Impact(num_envs=2, force=(200.0, 0.0, 0.0), randomize=False, pelvis="fixed", motion=("none",))
     t, m = run(push, method="cotap", stiffness=(800.0,))
     assert float(t.hand_error[:49, :, 0].max()) < 0.02
@@ -289,7 +289,7 @@ def test_the_command_writes_what_was_asked_for(protocol, checkpoint, tmp_path, c
     assert sum(result["falls"].values()) == result["num_falls"]
     assert result["arms"] == ("moving" if protocol == "impact" else "held")
     assert (tmp_path / "plot.png").stat().st_size > 5000
-    assert result["metrics"]["j_upper_blow"]["n"] == 16
+    assert result["metrics"]["j_upper_push"]["n"] == 16
     for of_loads in ("load_overshoot", "impedance_error"):
         assert (of_loads in result["metrics"]) == (protocol == "constant-load")
     assert "per_env" not in result
@@ -311,13 +311,13 @@ def test_a_held_hand_gives_way_as_the_stiffness_says(method, measured, tmp_path)
         assert metrics["displacement_z"]["mean"] == pytest.approx(-0.02, abs=5e-4)
 
 
-def test_the_blow_itself_is_the_first_tenth_of_a_second():
+def test_the_push_itself_is_the_first_tenth_of_a_second():
     protocol = Impact(num_envs=1)
     t = trajectory(steps=150, envs=1)
     t.arm_torque[50:55, 0, 0] = 30.0
     env = HumanoidEnv(protocol.configure(HumanoidEnvConfig(num_threads=1)))
     m = protocol.measure(t, env)["metrics"]
-    assert m["j_upper_blow"]["mean"] == pytest.approx(30.0)
+    assert m["j_upper_push"]["mean"] == pytest.approx(30.0)
     assert m["j_upper"]["mean"] == pytest.approx(3.0)
 
 

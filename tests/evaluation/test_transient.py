@@ -73,7 +73,7 @@ def test_the_energy_of_an_oscillation_tells_damping_not_pitch():
     assert fast["settle_s"] == pytest.approx(0.5 * slow["settle_s"], rel=0.02)
 
 
-def test_the_blow_itself_is_left_out_and_both_hands_are_averaged():
+def test_the_push_itself_is_left_out_and_both_hands_are_averaged():
     t = struck(0.2)
     onset, release = round(ONSET_S / DT), round((ONSET_S + 0.1) / DT)
     late = transient_measures(t, onset, release, len(t.fell), [0], 0.5)

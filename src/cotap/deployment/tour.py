@@ -105,13 +105,13 @@ def _run(
     for step in range(tour.waypoints * tour.segment_steps):
         time_s = step * CONTROL_S
         asked = pilot.command(time_s, *_pelvis(robot), robot.truth().heading_w)
-        law, blows = controller.step(robot.read()), []
+        law, pushes = controller.step(robot.read()), []
         _ask(controller, *asked, robot.spec)  # seen at the next step, as in batched MuJoCo
         if punches.active:
             joint, force_w = (part[0] for part in punches.at(torch.tensor([time_s])))
             link = links[robot.spec.joint_names[joint]]
-            blows = [PointForce(link, (0.0, 0.0, 0.0), force_w.numpy())] if force_w.any() else []
-        robot.act(law, free, others=blows)
+            pushes = [PointForce(link, (0.0, 0.0, 0.0), force_w.numpy())] if force_w.any() else []
+        robot.act(law, free, others=pushes)
         qpos, qvel = (torch.from_numpy(x.copy())[None] for x in (robot.engine.qpos, robot.engine.qvel))
         way, turn = pilot.error(step // tour.segment_steps, *_pelvis(robot))
         torque = torch.from_numpy(robot.torque())[None]

@@ -1,4 +1,4 @@
-"""Punches: short blows on random joints in random directions, one in every segment of time, growing over an episode."""
+"""Punches: short pushes on random joints in random directions, one in every segment of time, growing in an episode."""
 
 from __future__ import annotations
 

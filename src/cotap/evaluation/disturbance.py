@@ -108,7 +108,7 @@ class Impact(Scenario):
         window = window_measures(t, begin, end, hit)
         if any(self.force):
             window |= response_measures(t, onset, begin, end, hit)
-            window["j_upper_blow"] = window_measures(t, onset, onset + round(PUSH_S / t.dt), hit)["j_upper"]
+            window["j_upper_push"] = window_measures(t, onset, onset + round(PUSH_S / t.dt), hit)["j_upper"]
         release = onset + round(self.duration / t.dt)
         if any(self.force) and release < end:
             window |= transient_measures(t, onset, release, end, hit, BEFORE_S)

@@ -20,7 +20,7 @@ UNITS = {
     "energy": "J", "recovery_s": "s", "settle_s": "s", "transient_energy": "J/kg", "oscillation_energy": "J/kg",
     "displacement_x": "m", "displacement_y": "m", "displacement_z": "m",
     "impedance_error": "m", "free_hand_error": "m", "loaded_hand_error": "m", "push_resistance": "N",
-    "survival_s": "s", "position_error": "m", "yaw_error": "rad", "vibration": "rad/s^2", "j_upper_blow": "Nm",
+    "survival_s": "s", "position_error": "m", "yaw_error": "rad", "vibration": "rad/s^2", "j_upper_push": "Nm",
     "elbow_amplitude": "Nm", "elbow_rms": "Nm", "elbow_peak": "Nm", "arm_rms": "Nm", "hand_swing": "m",
     "stiffness": "N/m", "store_energy": "J", "stiffening_delay_s": "s",
 }  # fmt: skip
