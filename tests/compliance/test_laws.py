@@ -182,12 +182,19 @@ def test_numbers_may_lie_at_their_bounds_and_not_beyond(field, low, high):
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_each_axis_has_bounds_on_its_stiffness(axis):
     for bound, beyond in ((1.0, math.nextafter(1.0, 0.0)), (1e5, math.nextafter(1e5, math.inf))):
-        each = [300.0, 300.0, 300.0]
-        each[axis] = bound
+        each = [bound, bound, bound]
         LawConfig(stiffness=tuple(each)).check()
         each[axis] = beyond
         with pytest.raises(ValueError, match=rf"law\.stiffness\[{axis}\] must lie in"):
             LawConfig(stiffness=tuple(each)).check()
+
+
+def test_axes_differ_by_no_more_than_the_blend_bears():
+    LawConfig(stiffness=(10.0, 3000.0, 300.0)).check()
+    with pytest.raises(
+        ValueError, match=r"law\.stiffness may be at most 300 times as much .* got \(10\.0, 3001\.0, 10"
+    ):
+        LawConfig(stiffness=(10.0, 3001.0, 10.0)).check()
 
 
 def test_only_cotap_has_an_energy_store():

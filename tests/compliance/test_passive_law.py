@@ -282,3 +282,14 @@ def test_a_law_without_a_store_leaves_an_empty_one(arms):
     plain, _ = CoTaPLaw(arms, LawConfig("cotap"))(state, parameters(2))
     assert torch.equal(torque.stiffness, plain.stiffness)
     assert report.values["store_energy"].tolist() == [[2.0, 2.0], [0.0, 0.0]]
+
+
+def test_an_arm_whose_stiffness_is_not_positive_definite_keeps_it_and_stops_no_other():
+    old = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
+    old[1, 0, 0] = -1e-9
+    new, error, room = 2.0 * torch.eye(4).double().repeat(3, 1, 1), torch.full((3, 4), 0.1).double(), torch.ones(3)
+    stiffness, _, share, injected = held_spring(old, new, error, error, room)
+    assert torch.equal(stiffness[1], old[1])
+    assert torch.equal(stiffness[[0, 2]], new[[0, 2]])
+    assert share.tolist() == [1.0, 0.0, 1.0]
+    torch.testing.assert_close(injected, torch.tensor([0.02, 0.0, 0.02], dtype=torch.float64))

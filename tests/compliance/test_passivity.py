@@ -81,6 +81,13 @@ def test_the_share_is_the_largest_one_that_bisection_finds(rng, dtype, near, spr
     assert float(torch.linalg.eigvalsh(held.stiffness.double()).min()) > 0.0
 
 
+def test_a_direction_that_stiffens_most_and_hardly_counts_takes_no_share_away():
+    """`1/2 (1e5^s - 1) 0.01^2 = 1e-4` where `1e5^s = 3`."""
+    old, new = torch.eye(2, dtype=torch.float64), torch.diag(torch.tensor([1.0, 1e5], dtype=torch.float64))
+    held = hold_back(old, new, torch.tensor([0.3, 0.01], dtype=torch.float64), torch.tensor(1e-4, dtype=torch.float64))
+    assert float(held.share) == pytest.approx(math.log(3.0) / math.log(1e5), rel=1e-6)
+
+
 def test_energy_along_the_segment_is_convex_so_that_all_smaller_shares_are_admissible(rng):
     """Along the log-Euclidean segment it is not: halfway it can be above both ends."""
     a, b = random_spd(rng, 300, spread=3.0), random_spd(rng, 300, spread=3.0)

@@ -47,6 +47,22 @@ def test_closed_forms_of_three_by_three(rng):
     torch.testing.assert_close(one, torch.eye(3).double().unsqueeze(-1).expand_as(one), atol=1e-6, rtol=0)
 
 
+@pytest.mark.parametrize("least", [1e-4, 1e-6, 1e-8, 1e-12, 0.0])
+def test_a_small_eigenvalue_keeps_its_digits_beside_two_large_ones(rng, least):
+    basis = torch.linalg.qr(torch.randn(500, 3, 3, dtype=torch.float64, generator=rng))[0]
+    values = torch.tensor([least, 0.3, 1.0], dtype=torch.float64)
+    found = eigenvalues_3x3(batch_last((basis * values) @ basis.mT))
+    torch.testing.assert_close(found, values.unsqueeze(1).expand_as(found), rtol=1e-9, atol=1e-15)
+
+
+def test_eigenvalues_of_rank_one(rng):
+    """The others are rounding, of whatever sign, and no more than that."""
+    x = torch.randn(5000, 3, 1, dtype=torch.float64, generator=rng)
+    found = eigenvalues_3x3(batch_last(x @ x.mT))
+    torch.testing.assert_close(found[2], x.square().sum((1, 2)))
+    assert float((found[:2].abs() / found[2]).max()) < 1e-6
+
+
 @pytest.mark.parametrize("n", [1, 2, 4, 7])
 def test_inverses_and_determinants(rng, n):
     a = positive_definite(rng, n, 3.0)

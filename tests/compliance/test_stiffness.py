@@ -232,7 +232,7 @@ def test_without_the_ratio_it_is_the_papers_law_up_to_a_straight_arm(rng):
 
 
 @pytest.mark.parametrize("joints", [4, 7])
-@pytest.mark.parametrize("smallest", [0.0, 1e-8, 1e-7, 1e-6, 4e-6, 1e-5])
+@pytest.mark.parametrize("smallest", [0.0, 1e-8, 1e-7, 1e-6, 3.3e-6, 4e-6, 1e-5, 1e-4])
 def test_without_a_direction_to_move_in_it_is_pd(joints: int, smallest: float, rng):
     """Where rank is lost, to rounding or wholly, whatever the stiffness of each direction and alpha."""
     u, s, v = torch.linalg.svd(torch.randn(2000, 3, joints, dtype=DOUBLE, generator=rng), full_matrices=False)
@@ -247,6 +247,22 @@ def test_without_a_direction_to_move_in_it_is_pd(joints: int, smallest: float, r
     values = torch.linalg.eigvalsh(paper.stiffness)  # the paper's law asks for next to nothing there
     assert (values[:, 0] > -1e-6 * values[:, -1]).all()
     assert torch.isfinite(paper.pseudo_inverse).all()
+
+
+@pytest.mark.parametrize("cond", [10.0, 1e2, 1e3, 1e4, 1e5, 3e5])
+@pytest.mark.parametrize(("apart", "rtol"), [(15.0, 2e-3), (100.0, 5e-3), (300.0, 0.1)])
+def test_directions_of_very_different_stiffness_near_a_singularity(apart: float, rtol: float, cond: float, rng):
+    """What the blend asks for lies between what compliance and PD do: rounding leaves it positive."""
+    u, s, v = torch.linalg.svd(torch.randn(2000, 3, 4, dtype=DOUBLE, generator=rng), full_matrices=False)
+    s[:, 2] = s[:, 0] / cond
+    j, one = u @ torch.diag_embed(s) @ v, torch.ones(2000, dtype=DOUBLE)
+    for axis in range(3):
+        task = torch.full((2000, 3), 80.0, dtype=DOUBLE)
+        task[:, axis] *= apart
+        values = torch.linalg.eigvalsh(blended_stiffness(j, task, 40.0 * one, 100.0 * one, one).stiffness)
+        assert float(values.min()) > 0.0
+        if cond >= 1e4:
+            torch.testing.assert_close(values, torch.full_like(values, 100.0), rtol=rtol, atol=0.0)
 
 
 @pytest.mark.parametrize("apart", [0.0, 2e-7, 1e-5, 0.03])

@@ -1,13 +1,16 @@
-"""The torso on its legs as springs, against a hinge worked by hand and against MuJoCo's statics."""
+"""The torso on its legs as springs, against a hinge worked by hand and MuJoCo's kinematics."""
 
 from __future__ import annotations
 
-import math
+from dataclasses import replace
 
+import mujoco
+import numpy as np
 import pytest
 import torch
 
 from cotap.compliance.torso import chain_compliance, hand_base_compliance, parallel, torso_compliance
+from cotap.envs.upper_body import TorsoComplianceConfig, _TorsoModel
 
 DOUBLE = torch.float64
 
@@ -71,20 +74,36 @@ def test_hands_move_as_the_body_that_a_force_on_them_turns(rng):
     torch.testing.assert_close(moved, v + torch.linalg.cross(w, lever))
 
 
-def test_support_model_against_finite_differences_of_the_legs(make_env):
-    """One foot: the torso's compliance from how its pose against the sole changes with the leg's joints."""
-    env = make_env(1)
-    env.step(torch.zeros(1, 19))
-    from cotap.envs.upper_body import TorsoComplianceConfig, _TorsoModel
+@pytest.mark.parametrize("foot", [0, 1])
+def test_support_model_against_finite_differences_in_mujoco(make_env, robot, foot):
+    """On one foot: every joint of leg and waist is a spring, and turns the torso against the sole as MuJoCo has it."""
+    env = make_env(1, robot=robot)
+    spec, model, s = env.spec, env.sim.model, replace(env.state, foot_force=1e3 * torch.eye(2)[[foot]])
+    sole, torso = spec.feet[foot], model.body(spec.torso_body).id
+    leg = [body.joint for body in spec.chain(sole.body, spec.base_body)]
+    heading = s.heading_w[0].double().numpy()
 
-    model = _TorsoModel(TorsoComplianceConfig(model="support"), env.spec)
-    s = env.state
-    c = model._support(s)
-    legs_on_ground = s.foot_contact[0].tolist()
-    assert torch.isfinite(c).all()
-    if any(legs_on_ground):
-        values = torch.linalg.eigvalsh(c[0].double())
-        assert float(values.min()) > -1e-6
-        # Ankles and hips of 40 to 200 Nm/rad, a metre below, yield by millimetres a newton.
-        assert 1e-3 < float(c[0, 0, 0]) < 0.1
-    assert math.isfinite(float(model.hand_compliance(s, s.heading_w.transpose(1, 2) @ s.torso_rotation_w).sum()))
+    def pose(name: str, angle: float) -> tuple[np.ndarray, np.ndarray]:
+        """The torso's origin and rotation, as the sole sees them, carried to where the sole was."""
+        data = mujoco.MjData(model)
+        data.qpos[:] = env.sim.qpos[0].numpy()
+        data.qpos[model.joint(name).qposadr[0]] += angle
+        mujoco.mj_kinematics(model, data)
+        ground = data.body(sole.body)
+        turn = ground.xmat.reshape(3, 3)
+        return turn.T @ (data.xpos[torso] - ground.xpos), turn.T @ data.xmat[torso].reshape(3, 3)
+
+    data = mujoco.MjData(model)
+    data.qpos[:] = env.sim.qpos[0].numpy()
+    mujoco.mj_kinematics(model, data)
+    to_heading = heading.T @ data.body(sole.body).xmat.reshape(3, 3)
+    expected = np.zeros((6, 6))
+    gains = {joint.name: joint.kp for joint in spec.joints}
+    for name in (*leg, *spec.waist_joints):
+        (p0, r0), (p1, r1) = pose(name, -1e-5), pose(name, 1e-5)
+        turned = (r1 - r0) @ r0.T / 2e-5
+        rate = np.array([turned[2, 1], turned[0, 2], turned[1, 0]])
+        twist = np.concatenate((to_heading @ (p1 - p0) / 2e-5, to_heading @ rate))
+        expected += np.outer(twist, twist) / gains[name]
+    found = _TorsoModel(TorsoComplianceConfig(model="support"), spec)._support(s)[0].numpy()
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())

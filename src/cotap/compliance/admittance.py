@@ -85,8 +85,9 @@ class VirtualMass:
         if square > 0.0:
             return shrink * torch.cos(damped * dt), shrink * torch.sin(damped * dt) / damped
         sum_of_rates = self.damping_ratio + root  # one over their difference, which would lose digits
-        slow, fast = torch.exp(-natural * dt / sum_of_rates), torch.exp(-natural * dt * sum_of_rates)
-        return 0.5 * (slow + fast), 0.5 * (slow - fast) / damped
+        slow = torch.exp(-natural * dt / sum_of_rates)
+        gone = -torch.expm1(-2.0 * damped * dt)  # the faster one is less by this share
+        return slow * (1.0 - 0.5 * gone), 0.5 * slow * gone / damped
 
 
 class StaticShift:

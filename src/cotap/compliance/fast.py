@@ -22,8 +22,9 @@ import torch
 from cotap.compliance.small_matrices import batch_last, eigenvalues_3x3, inverse_3x3, plus_diagonal, product
 from cotap.compliance.stiffness import RANK_TOLERANCE
 
-_ROUNDING = 1e-11
-"""Share of the largest squared singular value below which the smallest is taken for rounding, more so the smaller."""
+_ROUNDING = 1e-8
+"""Share of the largest squared singular value below which the smallest is taken for rounding, more so the smaller. The
+rounding of the power's polynomial grows with its inverse, times how many times one task stiffness is the other."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ def blended_stiffness(
     missing = (tolerance**2 * squares[2].clamp_min(1e-12) - squares[0]).clamp_min(0.0)
     pseudo_inverse, projector, kept = _null_space(j, gram, squares, missing)
     # A direction that the arm can hardly move in is as stiff as the damped null space makes it.
-    lost = missing / (squares[0].clamp_min(0.0) + missing + 1e-300) * null
+    lost = missing / (squares[0] + missing + 1e-300) * null
     if task_stiffness.dim() == jacobian.dim():
         b = product(batch_last(torch.linalg.cholesky(task_stiffness.double()).mT), j)
     else:
@@ -110,7 +111,7 @@ def _null_space(
     (B,) of the direction of the smallest singular value that it leaves to the hand, 1 but for what is rounding.
     """
     transposed = j.transpose(0, 1)
-    smallest, least = squares[0].clamp_min(0.0), _ROUNDING * squares[2].clamp_min(1e-12)
+    smallest, least = squares[0], _ROUNDING * squares[2].clamp_min(1e-12)
     shift = (least - smallest).clamp_min(0.0)
     damped, exact = (inverse_3x3(plus_diagonal(gram, x)) for x in (missing.maximum(shift), shift))
     of_hand = product(transposed, product(exact, j))

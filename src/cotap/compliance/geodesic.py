@@ -17,8 +17,9 @@ import torch
 from cotap.compliance.arguments import symmetric_part
 from cotap.compliance.spd import log_from_eigenvectors
 
-_ITERATIONS = 12
-"""Of the search for a share. Each at least halves what is left, and squares it once it is small."""
+_ITERATIONS = 24
+"""Of the search for a share. Each goes down by one over the largest rate, or more, and squares what is left once it is
+small."""
 
 
 class HeldStiffness(NamedTuple):
@@ -51,7 +52,9 @@ def held_stiffness(
     See `cotap.compliance.passivity.hold_back`. Energy and share are in float64.
     """
     old, new, e, room = (x.double() for x in (k_old, k_new, error, available))
-    factor = torch.linalg.cholesky(old)
+    factor, info = torch.linalg.cholesky_ex(old)
+    refused = info > 0  # an arm whose stiffness is not positive definite, by rounding, keeps it; others go on
+    factor = torch.where(refused[..., None, None], torch.eye(old.shape[-1], dtype=old.dtype, device=old.device), factor)
     half = torch.linalg.solve_triangular(factor, new, upper=False)
     ratio = symmetric_part(torch.linalg.solve_triangular(factor, half.transpose(-1, -2), upper=False))
     values, vectors = torch.linalg.eigh(ratio.detach())
@@ -79,7 +82,7 @@ def held_stiffness(
     free = change_energy(old, new, e) <= room
     stiffness = torch.where(free[..., None, None], k_new, between)
     energy = change_energy(k_old, stiffness, error)
-    none = energy > room  # less is available than rounding needs
+    none = (energy > room) | refused  # less is available than rounding needs
     return HeldStiffness(
         torch.where(none[..., None, None], k_old, stiffness),
         torch.where(none, 0.0, torch.where(free, 1.0, share)),

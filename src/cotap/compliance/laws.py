@@ -75,6 +75,11 @@ class LawConfig:
         require_one_of(f"{where}.sensing", self.sensing, SENSING)
         for i, value in enumerate(self.stiffness):
             require_range(f"{where}.stiffness[{i}]", value, 1.0, 1e5)
+        if max(self.stiffness) > 300.0 * min(self.stiffness):  # beyond, rounding shows in the blend
+            raise ValueError(
+                f"{where}.stiffness may be at most 300 times as much along one axis as along another, got "
+                f"{self.stiffness}"
+            )
         require_range(f"{where}.null_stiffness", self.null_stiffness, 0.1, 1e4)
         require_range(f"{where}.alpha", self.alpha, 0.0, 1.0)
         require_range(f"{where}.condition_threshold", self.condition_threshold, 1.0, 1e9)
@@ -197,7 +202,8 @@ def _arm_stiffness(
     """What the arm contributes, diagonal (N, A, 3) or full (N, A, 3, 3), and where (N, A) it had to be bounded."""
     if base_compliance_h is None:
         return stiffness, torch.zeros_like(stiffness[..., 0], dtype=torch.bool)
-    compliance, projected = project_compliance(torch.diag_embed(1.0 / stiffness) - base_compliance_h, LEAST_COMPLIANCE)
+    left = torch.diag_embed(1.0 / stiffness.double()) - base_compliance_h.double()
+    compliance, projected = project_compliance(left, LEAST_COMPLIANCE)
     return inverse_3x3(compliance.movedim((-2, -1), (0, 1))).movedim((0, 1), (-2, -1)), projected
 
 

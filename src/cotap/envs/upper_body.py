@@ -96,7 +96,7 @@ class UpperBodyConfig:
 
     def built(self, law: LawConfig) -> LawConfig:
         """`law` as it is built here: without the ratio, no arm is near enough to singular to give way, or to be damped
-        there."""
+        there, but for hands whose orientation has a stiffness, too."""
         return law if self.singularity_ratio else replace(law, condition_threshold=math.inf)
 
 
