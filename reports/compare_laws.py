@@ -223,7 +223,7 @@ class Transient:
                 options = Options(protocol, laws, checkpoint=policy_of(self, name), threads=self.threads)
                 with redirect_stdout(StringIO()):  # its own table
                     result = run("impact", options)
-                kept = ("num_envs", "num_falls", "metrics", "window", "curve")
+                kept = ("num_envs", "num_falls", "metrics_without_falls", "window", "curve")
                 rows[name] = {k: result[k] for k in kept} | {
                     "checkpoint_sha256": result["settings"]["checkpoint_sha256"]
                 }
@@ -243,7 +243,7 @@ class Transient:
             ]  # fmt: skip
             for name, row in rows.items():
                 shown = [
-                    cell(row["metrics"][key], digits)
+                    cell(row["metrics_without_falls"][key], digits)
                     for key, digits in (
                         ("e_ee_hit", 3), ("share_at_limit", 2), ("transient_energy", 2), ("oscillation_energy", 3),
                         ("overshoot", 2), ("overshoots", 1), ("settle_s", 2),
@@ -263,7 +263,7 @@ def _verdicts(rows: dict[str, Any]) -> list[str]:
     """Of every CoTaP beside FACET: whether its hand oscillates less, as in the paper."""
     out = []
     for name in (n for n in rows if n.startswith("cotap, ") and "facet" in rows):
-        d = difference(*(rows[n]["metrics"]["oscillation_energy"] for n in ("facet", name)))
+        d = difference(*(rows[n]["metrics_without_falls"]["oscillation_energy"] for n in ("facet", name)))
         if d["difference"] is None:
             out.append(f"- {name}, oscillation beside facet's: not measured ({d['reason']})")
             continue

@@ -352,7 +352,12 @@ def test_the_laws_beside_cotap_are_a_part_with_facets_own_policy(trained, monkey
         "overshoots",
         "settle_s",
     )
-    struck = {"metrics": dict.fromkeys(keys, nothing), "num_falls": 1, "num_envs": 4, "curve": {"time": []}}
+    struck = {
+        "metrics_without_falls": dict.fromkeys(keys, nothing),
+        "num_falls": 1,
+        "num_envs": 4,
+        "curve": {"time": []},
+    }
     asked = []
     for table, result in ((Static, static), (Transient, {"forces": {"500": {"pd": struck}}})):
         monkeypatch.setattr(table, "measure", lambda self, result=result: asked.append(self) or result)

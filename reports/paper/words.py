@@ -54,7 +54,8 @@ def scaled(m: dict[str, Any] | None, factor: float, digits: int = 1) -> str:
     """A measure in a unit of which `factor` make one of its own, as mean and interval."""
     if m is None or m["mean"] is None:
         return number(m)
-    return number({"mean": factor * m["mean"], "ci95": [factor * bound for bound in m["ci95"]]}, digits)
+    bounds = m["ci95"] and [factor * bound for bound in m["ci95"]]
+    return number(m | {"mean": factor * m["mean"], "ci95": bounds}, digits)
 
 
 def fallen(result: dict[str, Any]) -> str:

@@ -42,9 +42,12 @@ def require_positive_int(name: str, value: int) -> int:
     return value
 
 
+LARGEST_SEED = 2**62
+
+
 def require_seed(name: str, value: int) -> int:
     """Return `value` if every random number generator takes it as a seed, else raise ValueError."""
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= 2**62:
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= LARGEST_SEED:
         raise ValueError(f"{name} must be an integer from 0 to 2**62, got {quoted(value)}")
     return value
 

@@ -146,13 +146,12 @@ def deploy(options: DeployOptions) -> dict[str, Any]:
 
 def summary(result: dict[str, Any]) -> str:
     """The result as Markdown."""
-    from cotap.evaluation.report import unit
+    from cotap.evaluation.report import interval, unit
 
     lines = ["| measure | mean | 95 % interval | unit |", "|---|---|---|---|"]
     for name, m in result["metrics"].items():
         if m["mean"] is not None:
-            low, high = m["ci95"]
-            lines.append(f"| {name} | {m['mean']:.4f} | {low:.4f} to {high:.4f} | {unit(name)} |")
+            lines.append(f"| {name} | {m['mean']:.4f} | {interval(m)} | {unit(name)} |")
     stops = "; ".join(f"stopped, {reason}: {count}" for reason, count in result["stops"].items())
     falls = f"{result['engine']}: {result['num_falls']} of {result['num_trials']} trials fell"
     return "\n".join([*lines, "", falls + (f" ({stops})" if stops else "") + f", {result['seconds']:.1f} s"])

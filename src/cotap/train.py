@@ -357,15 +357,17 @@ def _guide(env: Any, options: DistillOptions, base: dict[str, Any] | None) -> An
     """The frozen base; of a resumed run, one whose weights the checkpoint brings."""
     from cotap.agents.actors import DualActorCritic
     from cotap.agents.distillation import Guide
-    from cotap.agents.refit import REFITTED, take_over
+    from cotap.agents.refit import REFITTED, spread, take_over
     from cotap.agents.run_log import say
     from cotap.agents.runner import layout_of
 
     training = options.training
     layout = layout_of(env, training.ppo.symmetric)
     model = DualActorCritic(layout, training.ppo.hidden, training.distillation.new_std)
-    if base is not None and take_over(options.base_checkpoint, base, model, env, REFITTED):
-        say("the networks see or do something else than the base's, which were refitted to that")
+    if base is not None:
+        if take_over(options.base_checkpoint, base, model, env, REFITTED):
+            say("the networks see or do something else than the base's, which were refitted to that")
+        model.load_state_dict(spread(model.state_dict()))
     return Guide(model.to(training.device), training.distillation)
 
 

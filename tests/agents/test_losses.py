@@ -166,12 +166,12 @@ def test_advantages_with_full_trace_are_discounted_returns_less_the_value(rng):
 RATE = [
     # rate, kl, next; desired 0.01
     (9e-4, 0.021, 6e-4),  # moved too far
-    (9e-4, 0.004, 1.35e-3),  # hardly moved
+    (4e-4, 0.004, 6e-4),  # hardly moved
     (9e-4, 0.019, 9e-4),  # near enough, above
     (9e-4, 0.006, 9e-4),  # near enough, below
     (9e-4, 0.0, 9e-4),  # nothing was learned yet, which says nothing
     (1.2e-5, 1.0, 1e-5),  # never below the floor
-    (2.9e-3, 0.001, 3e-3),  # nor above the ceiling
+    (0.9e-3, 0.001, 1e-3),  # nor above the ceiling
 ]
 
 

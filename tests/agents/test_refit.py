@@ -12,7 +12,7 @@ from rsl_rl.modules import EmpiricalNormalization
 
 from cotap.agents.actors import DualActorCritic, Observations, as_dict
 from cotap.agents.checkpoint import CheckpointError
-from cotap.agents.refit import REFITTED, columns, take_over
+from cotap.agents.refit import REFITTED, columns, spread, take_over
 from cotap.agents.runner import layout_of
 from cotap.compliance.laws import LawConfig
 from cotap.envs import HumanoidEnv
@@ -162,6 +162,13 @@ def test_columns_run_term_by_term_and_oldest_first():
         "present": [("a", 0), ("a", 1), ("b", 0)],
         "privileged": [("c", 0), ("c", 1)],
     }
+
+
+def test_what_never_varied_is_not_seen_hundreds_of_deviations_away():
+    of_policy = {"_mean": [[0.0, 1.0]], "_std": [[0.0, 2.0]], "_var": [[0.0, 4.0]]}
+    found = spread({f"normalizers.policy.{name}": torch.tensor(value) for name, value in of_policy.items()})
+    now = {name.removeprefix("normalizers.policy."): value.tolist() for name, value in found.items()}
+    assert now == {"_mean": [[0.0, 1.0]], "_std": [[1.0, 2.0]], "_var": [[1.0, 4.0]]}
 
 
 def test_nothing_is_refitted_where_nothing_differs(make_env: MakeEnv):

@@ -103,6 +103,12 @@ def test_impulses_are_of_one_range_wherever_they_act(rng):
         assert float(drawn.mean()) == pytest.approx(0.75, rel=0.03)
 
 
+def test_impulses_beside_the_base_may_be_smaller(rng):
+    p = pushes(6000, velocity=(1.0, 1.0), beside_base=0.4)
+    size = one_push(p, rng).norm(dim=1) / MASS
+    torch.testing.assert_close(size, torch.where(p.place == 0, 1.0, 0.4))
+
+
 def test_directions_are_all_round_and_nearly_level(rng):
     unit = torch.nn.functional.normalize(one_push(pushes(8000, velocity=(0.5, 1.0)), rng), dim=1)
     pitch = unit[:, 2].asin()

@@ -191,6 +191,7 @@ CASES = [
     ),
     ("upright", {"projected_gravity_t": [[0.3, -0.4, -math.sqrt(0.75)]]}, 0.25),
     ("vertical_velocity", {"torso_linear_velocity_h": [[0.5, -0.2, -0.3]]}, 0.09),
+    ("vertical_velocity", {"torso_linear_velocity_h": [[0.5, -0.2, -100.0]]}, 25.0),
     ("roll_pitch_rate", {"torso_angular_velocity_t": [[0.3, -0.4, 7.0]]}, 0.25),
     ("roll_pitch_rate", {"torso_angular_velocity_t": [[30.0, -600.0, 7.0]]}, 800.0),
     ("contact_schedule", {"foot_force": [[250.0, 4.9]]}, 0.5),

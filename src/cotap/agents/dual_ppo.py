@@ -258,6 +258,8 @@ class DualPPO:
             log[f"{name}/learning_rate"] = self.learning_rates[name]
             if self.guide and name in self.guide.cfg.agents:
                 log[f"{name}/base_beta"] = self.guide.beta(self.iterations - 1)
+            spread = r.means[..., self.layout.action_slices[name]].flatten(0, 1).std(0)
+            log[f"{name}/action_spread"] = float(spread.mean())  # over states; at zero the policy answers none
             log[f"{name}/action_std"] = float(self.model.log_std[name].detach().exp().mean())
         return log
 

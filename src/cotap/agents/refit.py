@@ -57,6 +57,15 @@ def take_over(
     return refits
 
 
+def spread(model: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """`model` with a standard deviation of one for observations that never varied, as forces that were off: it acts as
+    before, and does not see hundreds of deviations once they do vary."""
+    return {
+        name: torch.where(value == 0.0, 1.0, value) if name.endswith(("_std", "_var")) else value
+        for name, value in model.items()
+    }
+
+
 def refit(
     model: dict[str, torch.Tensor], saved: dict[str, Any], fresh: DualActorCritic, present: dict[str, Any]
 ) -> dict[str, torch.Tensor]:

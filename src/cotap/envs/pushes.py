@@ -24,7 +24,9 @@ class PushConfig:
     episode_share: float = 0.8
     """Share of the episodes that have pushes."""
     velocity: tuple[float, float] = (0.0, 1.0)
-    """Impulse over the robot's mass, uniform, wherever it acts [m/s]."""
+    """Impulse over the robot's mass, uniform [m/s]."""
+    beside_base: float = 1.0
+    """Factor on the impulse of pushes that hit a hand or a link."""
     hand_share: float = 0.3
     """Share of the pushes that hit a hand."""
     link_share: float = 0.3
@@ -48,6 +50,7 @@ class PushConfig:
         require_range("pushes.episode_share", self.episode_share, 0.0, 1.0)
         require_range("pushes.hand_share", self.hand_share, 0.0, 1.0)
         require_range("pushes.link_share", self.link_share, 0.0, 1.0 - self.hand_share)
+        require_range("pushes.beside_base", self.beside_base, 0.0, 1e3)
         require_range("pushes.largest_pitch", self.largest_pitch, 0.0, 0.5 * math.pi)
         self.ramp.check("pushes.ramp")
 
@@ -118,7 +121,8 @@ class Pushes(Stateful):
         link = torch.randint(self._num_links, (n,), generator=rng, device=rng.device) + 1 + self._num_hands
         on_hand, on_link = kind < cfg.hand_share, kind >= 1.0 - cfg.link_share
         self._coming_place[mask] = torch.where(on_hand, hand, torch.where(on_link, link, torch.zeros_like(hand)))
-        self._coming_w[mask] = direction * uniform(rng, *cfg.velocity, n).unsqueeze(1)
+        velocity = uniform(rng, *cfg.velocity, n) * torch.where(on_hand | on_link, cfg.beside_base, 1.0)
+        self._coming_w[mask] = direction * velocity.unsqueeze(1)
         self._coming_s[mask] = uniform(rng, *cfg.duration_s, n)
         self._next_s[mask] = uniform(rng, *cfg.interval_s, n)
 

@@ -221,13 +221,14 @@ class LowerRewards:
 
     @term(-1.0)
     def vertical_velocity(s: StepRecord) -> torch.Tensor:
-        """Squared vertical velocity of the torso."""
-        return s.state.torso_linear_velocity_h[:, 2].square()
+        """Squared vertical velocity of the torso, up to 5 m/s: one robot whose simulation diverges would outweigh all
+        others."""
+        return s.state.torso_linear_velocity_h[:, 2].clamp(-5.0, 5.0).square()
 
     @term(-0.3)
     def roll_pitch_rate(s: StepRecord) -> torch.Tensor:
-        """Squared angular velocity of the torso about its horizontal axes, each up to 20 rad/s: one robot whose
-        simulation diverges would outweigh all others."""
+        """Squared angular velocity of the torso about its horizontal axes, each up to 20 rad/s, for the same
+        reason."""
         return s.state.torso_angular_velocity_t[:, :2].clamp(-20.0, 20.0).square().sum(1)
 
     @term(5.0)

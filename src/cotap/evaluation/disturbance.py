@@ -27,6 +27,8 @@ PUSH_S = 0.1
 """The time from the onset in which an arm takes a push [s]."""
 NEAR_LIMIT = 0.9
 """Share of its torque limit from which a joint counts as near it."""
+RECOVERED_M = 0.01
+"""A hand is back that errs by no more than this beyond what it did before."""
 LEAST_WAY_M = 0.005
 """A load that moves the hand less than this has no overshoot beside its sway [m]."""
 
@@ -88,8 +90,8 @@ class Impact(Scenario):
 
     def measured_steps(self, dt: float) -> range:
         """Control steps of the window."""
-        onset = round(self.onset / dt)
-        return range(*(onset + round(bound / dt) for bound in self.window))
+        onset, recorded = round(self.onset / dt), round(self.seconds / dt)
+        return range(*(min(onset + round(bound / dt), recorded) for bound in self.window))
 
     def before_step(self, env: HumanoidEnv, step: int) -> None:
         """Follow the arms through the window."""
@@ -109,7 +111,7 @@ class Impact(Scenario):
         if any(self.force):
             window |= response_measures(t, onset, begin, end, hit)
             window["j_upper_push"] = window_measures(t, onset, onset + round(PUSH_S / t.dt), hit)["j_upper"]
-        release = onset + round(self.duration / t.dt)
+        release = onset + math.ceil(self.duration / t.dt - 1e-6)
         if any(self.force) and release < end:
             window |= transient_measures(t, onset, release, end, hit, BEFORE_S)
         elif any(self.force) and self.place == "hand":
@@ -257,27 +259,31 @@ def impedance_error(
 def load_overshoot(t: Trajectory, onset: int, begin: int, end: int, hit: list[int]) -> torch.Tensor:
     """How far beyond its rest a load first carries the hands in `hit`, over the way to that rest, (N,).
 
-    Rest is the mean displacement from `begin` to before `end`; what counts is the displacement along it. NaN for a
-    env that fell before the window's end, or whose hand rests within `LEAST_WAY_M` of where it was.
+    Rest is the mean displacement from `begin` to before `end`; what counts is the displacement along it, up to where it
+    first turns back beyond half the way: what comes later is sway. NaN for an env that fell before the window's end, or
+    whose hand rests within `LEAST_WAY_M` of where it was.
     """
     offset = t.hand_offset[:, :, hit].mean(2)
     moved = offset[onset:end] - offset[onset - round(BEFORE_S / t.dt) : onset].mean(0)
     rest = moved[begin - onset :].mean(0)
     way = rest.norm(dim=1).clamp_min(1e-9)
-    furthest = (moved * (rest / way.unsqueeze(1))).sum(2).amax(0)
+    along = (moved * (rest / way.unsqueeze(1))).sum(2) / way
+    turned = (along[:-1] > 0.5) & (along[1:] < along[:-1])
+    first = torch.nn.functional.pad(turned.cumsum(0) == 0, (0, 0, 1, 0), value=True)  # up to the turn, and the turn
+    beyond = (torch.where(first, along, 0.0).amax(0) - 1.0).clamp_min(0.0)
     measured = t.alive()[end - 1] & (way > LEAST_WAY_M)
-    return torch.where(measured, furthest / way - 1.0, torch.full_like(way, math.nan))
+    return torch.where(measured, beyond, torch.full_like(way, math.nan))
 
 
 def recovery(error: torch.Tensor, alive: torch.Tensor, onset: int, dt: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """When `error` (T, N) is back for good under 1.5 times its mean of the half second before the onset.
+    """When `error` (T, N) is back for good within `RECOVERED_M` of its mean of the half second before the onset.
 
     Returns:
         Seconds (N,) from the onset, NaN where it never leaves, never comes back within the record, or the robot falls;
         and whether (N,) the robot stands and the error is back, or never left, by the record's end.
     """
     before = error[onset - round(BEFORE_S / dt) : onset].mean(0)
-    return back_within(error, 1.5 * before, alive, onset, dt)
+    return back_within(error, before + RECOVERED_M, alive, onset, dt)
 
 
 def falls_by_time(t: Trajectory, onset: int, end: int) -> dict[str, int]:

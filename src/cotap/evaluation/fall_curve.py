@@ -123,25 +123,24 @@ def half_point(
         seed: Of the bootstrap.
         resamples: Of the bootstrap.
     """
+    if not len(level):
+        return {"mean": None, "ci95": None, "reason": "no env stood until the push"}
     found = _crossing(impulse, level, fell)
-    if found is None:
-        if not len(level):
-            return {"mean": None, "ci95": None, "reason": "no env stood until the push"}
-        low = bool(fell[level == 0].float().mean() >= 0.5) if (level == 0).any() else False
-        reason = "half or more fall without a push" if low else f"fewer than half fall at {float(impulse[-1]):g} N s"
-        return {"mean": None, "ci95": None, "reason": reason}
+    if math.isinf(found):
+        beyond = f"fewer than half fall at {float(impulse[-1]):g} N s"
+        return {"mean": None, "ci95": None, "reason": beyond if found > 0.0 else "half or more fall without a push"}
     rng = torch.Generator().manual_seed(seed)
     n = len(level)
     draws = (torch.randint(0, n, (n,), generator=rng) for _ in range(resamples))
-    crossings = [_crossing(impulse, level[d], fell[d]) for d in draws]
-    known = torch.tensor([c for c in crossings if c is not None], dtype=torch.float64)
-    if len(known) < 0.975 * resamples:
+    crossings = sorted(_crossing(impulse, level[d], fell[d]) for d in draws)
+    low, high = (crossings[k] for k in (math.floor(0.025 * (resamples - 1)), math.ceil(0.975 * (resamples - 1))))
+    if math.isinf(low) or math.isinf(high):
         return {"mean": found, "ci95": None, "reason": "the interval reaches beyond the impulses that were tried"}
-    low, high = torch.quantile(known, torch.tensor([0.025, 0.975], dtype=torch.float64)).tolist()
     return {"mean": found, "ci95": [low, high]}
 
 
-def _crossing(impulse: torch.Tensor, level: torch.Tensor, fell: torch.Tensor) -> float | None:
+def _crossing(impulse: torch.Tensor, level: torch.Tensor, fell: torch.Tensor) -> float:
+    """Where half fall; minus infinity where they do at the least impulse, infinity where they do at none."""
     count = torch.bincount(level, minlength=len(impulse))
     seen = count > 0
     rate = torch.bincount(level, fell.double(), minlength=len(impulse))[seen] / count[seen]
@@ -149,7 +148,7 @@ def _crossing(impulse: torch.Tensor, level: torch.Tensor, fell: torch.Tensor) ->
 
     x, y = impulse[seen].double(), torch.from_numpy(isotonic_regression(rate.numpy(), weights=count[seen].numpy()).x)
     above = (y >= 0.5).nonzero().flatten()
-    if len(above) == 0 or int(above[0]) == 0:
-        return None
-    i = int(above[0])
+    i = int(above[0]) if len(above) else len(y)
+    if i in (0, len(y)):
+        return -math.inf if i == 0 else math.inf
     return float(x[i - 1] + (0.5 - y[i - 1]) / (y[i] - y[i - 1]) * (x[i] - x[i - 1]))

@@ -245,9 +245,9 @@ def _error(way: torch.Tensor, seed: int) -> dict[str, Any]:
     count = {"n": mean["n"], "wrong_way": int((way <= 0.0).sum())}
     if mean["mean"] is None:
         return {"error": None, "ci95": None, **count, "reason": "no env was counted"}
-    if mean["ci95"][0] <= 0.0:
+    low, high = mean["ci95"] or (mean["mean"], mean["mean"])
+    if low <= 0.0:
         return {"error": None, "ci95": None, **count, "reason": "the hand did not go where the load is"}
-    low, high = mean["ci95"]
     return {"error": 1.0 / mean["mean"] - 1.0, "ci95": [1.0 / high - 1.0, 1.0 / low - 1.0], **count}
 
 

@@ -170,7 +170,8 @@ def summarize(
 
     Numbers (N,) get a bootstrap interval, NaN left out; of several in an env, (N, K), the mean is over all of them, and
     an env's stay together in the bootstrap. Events (N,) bool get Wilson's interval, which has a width even where all
-    envs agree. Where nothing could be measured the numbers are null and `reason` says so.
+    envs agree. Where nothing could be measured the numbers are null, and of one env, or group, there is no interval;
+    `reason` says so.
 
     Args:
         values: Numbers or events of every env.
@@ -190,6 +191,8 @@ def summarize(
         return {"mean": mean, "std": std, "ci95": list(wilson_interval(mean, n)), "n": n}
     _, member = torch.unique((of_env if group is None else group)[finite], return_inverse=True)
     totals, sizes = torch.bincount(member, counted).float(), torch.bincount(member).float()
+    if len(sizes) == 1:
+        return {"mean": mean, "std": std, "ci95": None, "n": n, "reason": "one env has no interval"}
     draws = bootstrap_draws(len(sizes), seed, resamples)
     means = (draws @ totals) / (draws @ sizes)
     low, high = torch.quantile(means.double(), torch.tensor([0.025, 0.975], dtype=torch.float64)).tolist()

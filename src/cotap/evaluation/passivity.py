@@ -19,7 +19,7 @@ from cotap.evaluation.exciter import COMMANDS, GENES, Exciters, Limits, natural_
 from cotap.evaluation.law_options import LawOptions, parse_law
 from cotap.evaluation.metrics import summarize
 from cotap.evaluation.protocol import HELD, mirrored_pose, select_motion
-from cotap.evaluation.report import heading, pyplot, save_figure
+from cotap.evaluation.report import heading, interval, pyplot, save_figure
 from cotap.evaluation.rollout import UPPER_ACTIONS, PolicyFunction, acting, picture_row
 from cotap.evaluation.scenario import Stance
 from cotap.evaluation.stability import NOTHING_J, random_poses
@@ -275,8 +275,7 @@ def _cell(row: dict[str, Any]) -> str:
     diverged = f"; {row['num_diverged']} diverged" if row["num_diverged"] else ""
     if row["drawn"]["mean"] is None:
         return f"-{diverged}"
-    low, high = row["drawn"]["ci95"]
-    return f"{row['drawn']['mean']:.3f} ({low:.3f} to {high:.3f}); {row['largest']:.2f}{diverged}"
+    return f"{row['drawn']['mean']:.3f} ({interval(row['drawn'], 3)}); {row['largest']:.2f}{diverged}"
 
 
 def plot(path: Path, content: dict[str, Any]) -> None:

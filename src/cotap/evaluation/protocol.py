@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import torch
 
-from cotap.checks import require_positive_int, require_range, require_seed
+from cotap.checks import LARGEST_SEED, require_positive_int, require_range, require_seed
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.randomization import RandomizationConfig
 from cotap.envs.terminations import TerminationConfig
@@ -64,7 +64,8 @@ class Protocol(ABC):
         """Turn the environment that a policy was trained in into this protocol's. Changes and returns `env_cfg`."""
         self.check()
         disable_disturbances(env_cfg)
-        env_cfg.num_envs, env_cfg.seed, env_cfg.torque_limit_scale = self.num_envs, self.seed, self.torque_limit_scale
+        env_cfg.num_envs, env_cfg.torque_limit_scale = self.num_envs, self.torque_limit_scale
+        env_cfg.seed = LARGEST_SEED - self.seed  # far from those of trainings: these are not the robots they had
         late = min(RandomizationConfig().delay_s[1], env_cfg.control_dt)
         env_cfg.randomization = RandomizationConfig(enabled=self.randomize, delay_s=(0.0, late))
         env_cfg.terminations = TerminationConfig(episode_s=1e6)  # what ends an episode is a fall

@@ -88,6 +88,14 @@ def save_figure(figure: Any, path: Path) -> None:
     pyplot().close(figure)
 
 
+def interval(m: dict[str, Any], digits: int = 4, scale: float = 1.0) -> str:
+    """The 95 % interval of a summary, times `scale`, or why there is none."""
+    if m["ci95"] is None:
+        return m["reason"]
+    low, high = m["ci95"]
+    return f"{scale * low:.{digits}f} to {scale * high:.{digits}f}"
+
+
 def table(result: dict[str, Any]) -> str:
     """A Markdown table of an evaluation's metrics."""
     lines = ["| measure | mean | std | 95 % interval | unit |", "|---|---|---|---|---|"]
@@ -95,13 +103,10 @@ def table(result: dict[str, Any]) -> str:
         if m["mean"] is None:
             lines.append(f"| {name} | - | - | {m['reason']} | |")
             continue
-        low, high = m["ci95"]
-        lines.append(f"| {name} | {m['mean']:.4f} | {m['std']:.4f} | {low:.4f} to {high:.4f} | {unit(name)} |")
+        lines.append(f"| {name} | {m['mean']:.4f} | {m['std']:.4f} | {interval(m)} | {unit(name)} |")
     for name, value in result.get("slopes", {}).items():
-        interval = (
-            "{:.4f} to {:.4f}".format(*result["slopes_ci95"][name]) if value is not None else "no env walked or stood"
-        )
-        lines.append(f"| {name} | {'-' if value is None else f'{value:.4f}'} | | {interval} | |")
+        slope = {"ci95": result["slopes_ci95"][name], "reason": "no env walked or stood"}
+        lines.append(f"| {name} | {'-' if value is None else f'{value:.4f}'} | | {interval(slope)} | |")
     falls = f"{result['num_falls']} of {result['num_envs']} envs fell"
     return "\n".join([*lines, "", f"{heading(result)}: {falls}, {result['seconds']:.1f} s"])
 

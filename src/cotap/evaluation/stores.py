@@ -112,5 +112,5 @@ def curve(
         each = torch.where(running, ratio, 0.0).sum((0, 2)) / torch.where(count > 0, count, torch.nan)
         found = summarize(each, seed)
         rows["ratio"].append(found["mean"])
-        rows["ci95"].append(found["ci95"])
+        rows["ci95"].append(found["ci95"] or [found["mean"]] * 2)
     return rows

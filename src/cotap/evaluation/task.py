@@ -55,7 +55,7 @@ class Task(RolloutProtocol):
 
     def before_step(self, env: HumanoidEnv, step: int) -> None:
         """Keep what the last step was worth, and draw this one's random numbers whatever was drawn before: so what a
-        robot that falls draws changes nothing for the others, and evaluations with one seed differ by laws alone."""
+        robot that falls draws changes only what others draw in the same step."""
         if step:
             self._steps.append(step_figures(env))
         env.rng.manual_seed((1_000_003 * self.seed + step) % 2**63)
@@ -77,7 +77,7 @@ class Task(RolloutProtocol):
         shown = {name: m for name, m in result["metrics"].items() if name.startswith("return")}
         figure, axis = plt.subplots(figsize=(6, 3.4), constrained_layout=True)
         for name, m in shown.items():
-            low, high = m["ci95"]
+            low, high = m["ci95"] or (m["mean"], m["mean"])
             axis.bar(name, m["mean"], yerr=[[m["mean"] - low], [high - m["mean"]]], color="#2171b5", capsize=4)
         axis.set(ylabel="per second", title=f"{result['protocol']}, {result['method']}")
         axis.tick_params("x", rotation=20)

@@ -8,6 +8,8 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
+from cotap.evaluation.report import interval
+
 
 class Row(NamedTuple):
     """One policy, MuJoCo / PhysX; None where nothing is published."""
@@ -81,8 +83,7 @@ def _own_cells(result: dict[str, Any]) -> list[str]:
 def _interval(measure: dict[str, Any], scale: float) -> str:
     if measure["mean"] is None:
         return ""
-    low, high = (scale * bound for bound in measure["ci95"])
-    return f"{scale * measure['mean']:.1f} ({low:.1f} to {high:.1f})"
+    return f"{scale * measure['mean']:.1f} ({interval(measure, 1, scale)})"
 
 
 def _shown(value: float | None) -> str:

@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from tqdm import tqdm
 
 from cotap.agents.actors import as_dict
-from cotap.checks import require_one_of, require_positive_int, require_range
+from cotap.checks import LARGEST_SEED, require_one_of, require_positive_int, require_range
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.punches import PunchConfig, Punches
 from cotap.evaluation import report
@@ -27,8 +27,8 @@ from cotap.robots import RobotSpec
 from cotap.rotations import yaw_of
 
 ENGINES = ("mujoco", "pybullet")
-SEED_OFFSET = 2**62 + 1
-"""What is added to the seed: no other seed of the package may be that large, so that no training sees a tour."""
+SEED_OFFSET = LARGEST_SEED + 1
+"""What is added to the seed of punches, arms and ways: no training may have one that large."""
 _WAYPOINTS, _ARMS = 1, 2  # streams of random numbers; that of punches is 0
 FALL_S = 2.0
 """How long a film goes on after a fall [s]."""
