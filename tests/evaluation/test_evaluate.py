@@ -1,12 +1,14 @@
 """The evaluation command, end to end, on policies with random weights."""
 
+import copy
 import json
 from pathlib import Path
 
 import pytest
 import torch
 
-from cotap.envs import HumanoidEnvConfig
+from cotap.envs import HumanoidEnv, HumanoidEnvConfig
+from cotap.envs.randomization import RandomizationConfig
 from cotap.evaluate import evaluate, main
 from cotap.evaluation.policy import load_policy, shipped_checkpoint, shipped_names
 from cotap.evaluation.velocity_tracking import VelocityTracking
@@ -127,3 +129,14 @@ def test_a_held_load_is_filmed_from_its_start(tmp_path: Path, checkpoint: Path, 
     assert [len(film) for film in filmed] == [200, 200, 200]
     width = len(h1().joints) + 7 + 12
     assert {film.shape[1] for film in filmed} == {width}
+
+
+def test_robots_of_an_evaluation_are_not_those_of_the_training(robot):
+    """Masses are drawn once, from the seed: with that of the training they would be what the policy knows."""
+    trained = HumanoidEnvConfig(robot=robot, num_envs=8, num_threads=1, randomization=RandomizationConfig(enabled=True))
+    protocol = VelocityTracking(num_envs=8, seed=trained.seed)
+    ours, theirs = (HumanoidEnv(cfg) for cfg in (protocol.configure(copy.deepcopy(trained)), trained))
+    mass, other = (env.sim.field("body_mass") for env in (ours, theirs))
+    moving = mass.std(0) > 0.0
+    assert moving.any()
+    assert not (mass == other)[:, moving].any()

@@ -20,6 +20,10 @@ from cotap.evaluation.rollout import PolicyFunction, Trajectory, acting, record_
 from cotap.evaluation.undisturbed import disable_disturbances
 from cotap.motions.reference import HELD, MIXTURE, ClipConfig
 
+FIRST_SEED = 2**31
+"""Of an evaluation's envs, where its seed is 0: masses are drawn once, and from a training's seed they would be those
+that the policy knows. Generators of random numbers read the lowest 32 bits of a seed alone."""
+
 
 @dataclass
 class Protocol(ABC):
@@ -65,7 +69,7 @@ class Protocol(ABC):
         self.check()
         disable_disturbances(env_cfg)
         env_cfg.num_envs, env_cfg.torque_limit_scale = self.num_envs, self.torque_limit_scale
-        env_cfg.seed = LARGEST_SEED - self.seed  # far from those of trainings: these are not the robots they had
+        env_cfg.seed = (FIRST_SEED + self.seed) % LARGEST_SEED
         late = min(RandomizationConfig().delay_s[1], env_cfg.control_dt)
         env_cfg.randomization = RandomizationConfig(enabled=self.randomize, delay_s=(0.0, late))
         env_cfg.terminations = TerminationConfig(episode_s=1e6)  # what ends an episode is a fall
