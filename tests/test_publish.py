@@ -116,3 +116,18 @@ def test_a_run_of_another_recipe_does_not_ship(tmp_path: Path, package: Path, mo
     assert publish.main([str(source), "h1-base"]) == 2
     assert "ppo.hidden is [8, 8], not [256, 128, 64]" in capsys.readouterr().err
     assert not list(package.iterdir())
+
+
+def test_what_ships_may_be_evaluated_again_whatever_the_recipe_is_now(tmp_path: Path, package: Path, monkeypatch: Any):
+    shipped = package / "h1-base.pt"
+    package.mkdir()
+    save_random_policy(shipped)
+
+    def refuse(_content: dict) -> None:
+        raise ValueError("not of the recipe")
+
+    monkeypatch.setattr(publish, "require_default", refuse)
+    assert publish.main([str(shipped), "h1-base", "--envs", "2"]) == 0
+    assert json.loads((package / "h1-base.json").read_text())["sha256"] == sha256(shipped)
+    other = save_random_policy(tmp_path / "run.pt", seed=3)
+    assert publish.main([str(other), "h1-base", "--envs", "2"]) == 2
