@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shutil
 import sys
 import tempfile
 from pathlib import Path
@@ -105,9 +106,12 @@ def publish(source: Path, name: str, envs: int, threads: int = 0) -> int:
     target.parent.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory(dir=target.parent) as folder:
         staged = Path(folder) / target.name
-        content = strip(source, staged)
-        require_name(name, content)
-        if not (target.is_file() and sha256(source) == sha256(target)):  # what ships was of the recipe of its day
+        if target.is_file() and sha256(source) == sha256(target):  # what ships was of the recipe of its day
+            shutil.copyfile(source, staged)
+            content = load_checkpoint(staged)
+        else:
+            content = strip(source, staged)
+            require_name(name, content)
             require_default(content)
         headlines: dict[str, Any] = {}
         for evaluation, options in EVALUATIONS.items():

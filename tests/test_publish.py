@@ -122,12 +122,13 @@ def test_what_ships_may_be_evaluated_again_whatever_the_recipe_is_now(tmp_path: 
     shipped = package / "h1-base.pt"
     package.mkdir()
     save_random_policy(shipped)
+    before = sha256(shipped)
 
     def refuse(_content: dict) -> None:
         raise ValueError("not of the recipe")
 
     monkeypatch.setattr(publish, "require_default", refuse)
     assert publish.main([str(shipped), "h1-base", "--envs", "2"]) == 0
-    assert json.loads((package / "h1-base.json").read_text())["sha256"] == sha256(shipped)
+    assert json.loads((package / "h1-base.json").read_text())["sha256"] == sha256(shipped) == before
     other = save_random_policy(tmp_path / "run.pt", seed=3)
     assert publish.main([str(other), "h1-base", "--envs", "2"]) == 2
