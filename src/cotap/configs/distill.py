@@ -66,6 +66,8 @@ def paper(base: BaseTraining) -> DistillTraining:
     sampling = LawSampling(enabled=True, stiffness=(150.0, 450.0), log_uniform=False)
     training.env.upper_body = UpperBodyConfig(left=pd_damped, right=copy.deepcopy(pd_damped), sampling=sampling)
     training.env.forces.pushes.enabled = False
+    training.env.rewards.upper.reference_closeness = 1.0
+    training.ppo.value_clip = base.ppo.value_clip
     training.distillation.anew = ()
     training.train_for(20_000 * training.ppo.steps * 4096)
     return training
