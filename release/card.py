@@ -60,7 +60,7 @@ def percent(result: dict[str, Any]) -> dict[str, Any]:
 def slope(axis: str) -> Callable[[dict[str, Any]], dict[str, Any]]:
     """Measured over commanded, of all robots together."""
     name = f"slope_{axis}"
-    return lambda result: {"mean": result["slopes"][name], "ci95": result.get("slopes_ci95", {}).get(name)}
+    return lambda result: {"mean": result["slopes"][name], "ci95": result["slopes_ci95"][name]}
 
 
 def most(value: float) -> tuple[float, float]:

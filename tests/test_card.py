@@ -22,6 +22,7 @@ def write(folder: Path, name: str, robot: str, falls: float, yaw: float) -> None
     (folder / f"{name}.json").write_text(json.dumps({"robot": robot, "samples": 12_400_000}))
     share = {"mean": falls, "ci95": [falls / 2.0, falls * 2.0]}
     result = {"metrics": {"fall_fraction": share}, "slopes": {"slope_yaw": yaw}}
+    result["slopes_ci95"] = {"slope_yaw": [yaw - 0.01, yaw + 0.01]}
     (folder / f"{name}.some.json").write_text(json.dumps(result))
 
 
@@ -35,7 +36,7 @@ def test_what_is_missed_is_bold_by_what_is_asked_of_the_robot(tmp_path: Path, mo
     lines = card.card(["h1-base", "g1-base"], tmp_path).splitlines()
     assert "| samples | 300 M, CoTaP 150 M | the same | 12 M | 12 M |" in lines
     assert "| falls [%] | at most 0.5 | at most 1 | **0.8 (0.4 to 1.6)** | 0.8 (0.4 to 1.6) |" in lines
-    assert "| slope yaw | 0.93 to 1.07 | 0.93 to 1.07 | **1.08** | 0.94 |" in lines
+    assert "| slope yaw | 0.93 to 1.07 | 0.93 to 1.07 | **1.08 (1.07 to 1.09)** | 0.94 (0.93 to 0.95) |" in lines
 
 
 def test_what_was_not_measured_is_a_dash():

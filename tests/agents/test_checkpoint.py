@@ -283,16 +283,6 @@ FULL = {
 }
 
 
-def test_an_older_checkpoint_has_what_held_before_an_entry_was_there():
-    older, newer = {"actions": {"clip": 20.0}}, {"actions": {"clip": 20.0, "waist_share": 0.25}}
-    whole = {"actions": {"clip": 20.0, "waist_share": 1.0}}
-    require_layout("c.pt", older, whole)
-    require_layout("c.pt", newer, newer)
-    for saved, present in ((older, newer), (newer, whole), (whole, newer)):
-        with pytest.raises(CheckpointError, match="another actions"):
-            require_layout("c.pt", saved, present)
-
-
 @pytest.mark.parametrize("existed", [True, False])
 @pytest.mark.parametrize("error", FULL.values(), ids=FULL.keys())
 def test_full_disk_leaves_the_old_file_and_nothing_else(

@@ -178,10 +178,6 @@ def require_parts(path: Path | str, content: dict[str, Any], parts: Collection[s
             raise CheckpointError(f"checkpoint {str(path)!r} has no usable part {part!r}: {quoted(value)}")
 
 
-_ADDED: dict[str, dict[str, Any]] = {"actions": {"waist_share": 1.0}}
-"""What tables of the layout have gained, and what held before: older checkpoints lack it."""
-
-
 def require_layout(path: Path | str, saved: dict[str, Any], present: dict[str, Any]) -> None:
     """Raise CheckpointError naming the first entry in which a checkpoint's layout differs from the environment's.
 
@@ -190,7 +186,7 @@ def require_layout(path: Path | str, saved: dict[str, Any], present: dict[str, A
     for key, value in present.items():
         kept = saved.get(key)
         if isinstance(kept, dict) and isinstance(value, dict):
-            kept = {name: entry for name, entry in (_ADDED.get(key, {}) | kept).items() if name in value}
+            kept = {name: entry for name, entry in kept.items() if name in value}
         if not same(kept, value):
             raise CheckpointError(
                 f"checkpoint {str(path)!r} was trained with another {key}: {quoted(saved.get(key))}, here {value!r}"

@@ -347,7 +347,7 @@ class DualPPO:
             for name in self.names
         }
         self.iterations, self.samples = int(state["iterations"]), int(state["samples"])
-        for name, begun in state.get("begun_std", {}).items():  # older checkpoints lack it
+        for name, begun in state["begun_std"].items():
             if len(begun) != len(self._begun_std[name]):
                 raise ValueError(f"begun_std.{name} has {len(begun)} actions, expected {len(self._begun_std[name])}")
             self._begun_std[name] = [require_range(f"begun_std.{name}", std, 0.0, 1e6) for std in begun]

@@ -89,10 +89,9 @@ class Curriculum:
         return {"samples": self.samples, "falls_per_s": self.falls_per_s, "arm_motion": self.arm_motion}
 
     def load_state_dict(self, state: dict[str, float]) -> None:
-        """Take over what `state_dict` returned; an older one has no `arm_motion`, as arms always moved wholly. Raises
-        KeyError, TypeError or ValueError for something else."""
+        """Take over what `state_dict` returned. Raises KeyError, TypeError or ValueError for something else."""
         self.samples, self.falls_per_s = int(state["samples"]), float(state["falls_per_s"])
-        self.arm_motion = require_range("curriculum.arm_motion", float(state.get("arm_motion", 1.0)), 0.0, 1.0)
+        self.arm_motion = require_range("curriculum.arm_motion", float(state["arm_motion"]), 0.0, 1.0)
 
 
 @dataclass

@@ -28,7 +28,7 @@ UNITS = {
 LESS_IS_BETTER = (
     "e_lin", "e_lin_gait", "e_yaw", "e_yaw_gait", "e_height", "e_upper", "e_ee", "e_ee_hit", "e_path", "e_torso",
     "e_torso_x", "e_torso_y", "stand_drift", "foot_slip", "fall_fraction", "share_at_limit",
-    "joints_near_limit", "near_limit_share", "impedance_error", "recovery_s", "settle_s",
+    "joints_near_limit", "impedance_error", "recovery_s", "settle_s",
     "transient_energy", "oscillation_energy", "overshoot", "overshoots", "load_overshoot", "stiffness_error",
     "position_error", "yaw_error", "vibration", "free_hand_error", "loaded_hand_error", "push_resistance",
     "held_back", "stiffening_delay_s",
