@@ -20,7 +20,7 @@ OUTSIDE = {
     "README.md": "overview.md",
 }
 """Files of the repository that the site has too, and how it calls them; all of examples/ as well."""
-MEASURED = ("results_g1.md", "redundancy.md")
+MEASURED = ("results.md", "results_g1.md", "redundancy.md")
 """Pages that reports write once there is a policy to measure; the site has those that are there."""
 COMMANDS = "<!-- commands -->"
 """Where a page has the table of commands."""

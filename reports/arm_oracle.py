@@ -1,10 +1,11 @@
-"""What an agent of the arms could add at most: offsets that undo what the arms' own inertia costs, known exactly.
+"""What offsets of the arms' targets add that undo what the arms' inertia costs, beside what a policy's agent adds.
 
 python -m reports.arm_oracle --checkpoint h1-cotap --stiffness 300 --alpha 1 --num-envs 256
 
 Options are those of `cotap evaluate velocity-tracking`. Three evaluations follow, alike in all but the arms' targets:
 the raw reference; the policy's; and the raw reference plus `K^-1 M a`, where `K` is the joint stiffness that the law
-commands, `M` the arm's inertia and `a` the reference's acceleration. `K` and `a` no policy is shown.
+commands, `M` the nominal inertia of the arm and `a` the reference's acceleration. It is no bound: other errors, as of
+masses that differ or of a torso that moves, are left.
 """
 
 from __future__ import annotations

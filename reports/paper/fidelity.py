@@ -122,7 +122,8 @@ def worst(rows: list[dict[str, Any]], axis: str) -> str:
     if None in [r["error"] for r in measured]:
         return "no bound"
     largest = max(measured, key=lambda r: abs(r["error"]))
-    return f"{largest['error']:+.1%} [{largest['ci95'][0]:+.1%},{largest['ci95'][1]:+.1%}]"
+    shown = "[{:+.1%},{:+.1%}]".format(*largest["ci95"]) if largest["ci95"] else f"({largest['reason']})"
+    return f"{largest['error']:+.1%} {shown}"
 
 
 def within(rows: list[dict[str, Any]], allowed: float) -> str:

@@ -57,4 +57,4 @@ def no_worse(mine: dict[str, Any], base: dict[str, Any]) -> bool | None:
     """Within 10 % of the base's mean, or not beyond its 95 % interval; None unless both were measured."""
     if mine["mean"] is None or base["mean"] is None:
         return None
-    return mine["mean"] <= max(1.1 * base["mean"], base["ci95"][1])
+    return mine["mean"] <= max([1.1 * base["mean"], *(base["ci95"] or [])[1:]])

@@ -12,7 +12,7 @@ import stat
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import pytest
 import torch
@@ -293,8 +293,8 @@ def test_full_disk_leaves_the_old_file_and_nothing_else(
         save_checkpoint(path, CONTENT)
     before = path.read_bytes() if existed else None
 
-    def fail_part_way(_content: Any, target: Path) -> None:
-        Path(target).write_bytes(b"PK" * 2000)
+    def fail_part_way(_content: Any, target: IO[bytes]) -> None:
+        target.write(b"PK" * 2000)
         raise error
 
     monkeypatch.setattr(torch, "save", fail_part_way)
@@ -308,8 +308,8 @@ def test_full_disk_leaves_the_old_file_and_nothing_else(
 def test_interrupted_save_leaves_the_old_file_and_nothing_else(good: Path, monkeypatch: pytest.MonkeyPatch):
     before = good.read_bytes()
 
-    def interrupt(_content: Any, target: Path) -> None:
-        Path(target).write_bytes(b"PK")
+    def interrupt(_content: Any, target: IO[bytes]) -> None:
+        target.write(b"PK")
         raise KeyboardInterrupt
 
     monkeypatch.setattr(torch, "save", interrupt)
@@ -358,3 +358,10 @@ def test_json_is_readable_and_ends_in_a_newline(tmp_path: Path):
 def test_sha256_of_a_known_text(tmp_path: Path):
     (tmp_path / "abc").write_text("abc")
     assert sha256(tmp_path / "abc") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+
+
+def test_files_of_equal_content_are_equal(tmp_path: Path):
+    content = {"model": {"a": torch.arange(5.0)}, "samples": 3}
+    for name in ("one.pt", "other.pt"):
+        save_checkpoint(tmp_path / name, content)
+    assert sha256(tmp_path / "one.pt") == sha256(tmp_path / "other.pt")

@@ -377,11 +377,11 @@ def fail_saves(monkeypatch: pytest.MonkeyPatch, iterations: Collection[int]) -> 
     """Saves of these iterations fail as on a full disk."""
     real = torch.save
 
-    def save(content: Any, path: Any) -> None:
+    def save(content: Any, file: Any) -> None:
         if content["iteration"] in iterations and content["env"]:
-            Path(path).write_bytes(b"part")
+            file.write(b"part")
             raise RuntimeError("PytorchStreamWriter failed writing file")
-        real(content, path)
+        real(content, file)
 
     monkeypatch.setattr(torch, "save", save)
 
@@ -418,10 +418,10 @@ def test_an_older_checkpoint_that_cannot_be_replaced_is_kept(
 ):
     real = torch.save
 
-    def save(content: Any, path: Any) -> None:
+    def save(content: Any, file: Any) -> None:
         if not content["env"]:
             raise RuntimeError("full")
-        real(content, path)
+        real(content, file)
 
     monkeypatch.setattr(torch, "save", save)
     runner = make_runner(tmp_path, 4, save_interval=2)

@@ -68,7 +68,8 @@ def save_checkpoint(path: Path, content: dict[str, Any]) -> None:
 
     def write(temporary: Path) -> None:
         try:
-            torch.save(payload, temporary)
+            with temporary.open("wb") as file:  # given a path, torch would write the temporary name into the file
+                torch.save(payload, file)
         except RuntimeError as error:  # torch reports a full disk this way
             raise OSError(f"cannot write checkpoint {path}: {error}") from error
 

@@ -248,7 +248,10 @@ def _error(way: torch.Tensor, seed: int) -> dict[str, Any]:
     low, high = mean["ci95"] or (mean["mean"], mean["mean"])
     if low <= 0.0:
         return {"error": None, "ci95": None, **count, "reason": "the hand did not go where the load is"}
-    return {"error": 1.0 / mean["mean"] - 1.0, "ci95": [1.0 / high - 1.0, 1.0 / low - 1.0], **count}
+    error = {"error": 1.0 / mean["mean"] - 1.0, **count}
+    if mean["ci95"] is None:
+        return error | {"ci95": None, "reason": mean["reason"]}
+    return error | {"ci95": [1.0 / high - 1.0, 1.0 / low - 1.0]}
 
 
 def table(content: dict[str, Any]) -> str:
@@ -258,9 +261,8 @@ def table(content: dict[str, Any]) -> str:
         "|---|---|---|---|---|---|",
     ]
     for row in content["fidelity"]:
-        error, interval = "-", row.get("reason", "")
-        if row["error"] is not None:
-            error, interval = f"{row['error']:+.1%}", "{:+.1%} to {:+.1%}".format(*row["ci95"])
+        error = "-" if row["error"] is None else f"{row['error']:+.1%}"
+        interval = row["reason"] if row["ci95"] is None else "{:+.1%} to {:+.1%}".format(*row["ci95"])
         counts = f"{row['n']} | {row['wrong_way']}"
         lines.append(f"| {row['axis']} | {row['stiffness']:g} | {error} | {interval} | {counts} |")
     notes = [
@@ -281,7 +283,7 @@ def plot(path: Path, content: dict[str, Any]) -> None:
     for name, color in zip("xyz", ("#cb181d", "#238b45", "#2171b5"), strict=True):
         rows = [r for r in content["fidelity"] if r["axis"] == name and r["error"] is not None]
         error = [100.0 * r["error"] for r in rows]
-        spread = [[100.0 * abs(r["error"] - r["ci95"][k]) for r in rows] for k in (0, 1)]
+        spread = [[100.0 * abs(r["error"] - (r["ci95"] or [r["error"]] * 2)[k]) for r in rows] for k in (0, 1)]
         axis.errorbar([r["stiffness"] for r in rows], error, spread, fmt="o-", color=color, ms=3, capsize=2, label=name)
         boundless = [r["stiffness"] for r in content["fidelity"] if r["axis"] == name and r["error"] is None and r["n"]]
         axis.plot(boundless, [1.0] * len(boundless), "x", color=color, transform=axis.get_xaxis_transform())
