@@ -65,7 +65,10 @@ def _run(args: list[str]) -> int:
         if (error.name or "").partition(".")[0] == "cotap":
             raise
         extra = _EXTRAS.get(args[0], "train")
-        print(f"error: cotap {args[0]} needs {error.name}: pip install 'cotap[{extra}]'", file=sys.stderr)
+        print(
+            f"error: cotap {args[0]} needs {error.name}: in cotap's folder, pip install -e '.[{extra}]'",
+            file=sys.stderr,
+        )
         return 2
     return module.main(args[1:])
 

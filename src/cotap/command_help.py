@@ -113,7 +113,7 @@ def _in_short(option: Option) -> str:
     """What an option is, in its first sentence: on a line or two beside its name."""
     sentence = re.split(r"(?<=\.)\s", option.help, maxsplit=1)[0]
     joined = option.note.replace(" ", _JOINT)  # stays on one line
-    note = f" ({joined})" if 0 < len(joined) <= 12 else ""
+    note = f" ({joined})" if 0 < len(joined) <= 16 else ""
     lines = textwrap.wrap(sentence + note, WIDTH - _FIRST, break_on_hyphens=False)
     indent = "\n" + " " * _FIRST
     label = f"  {option.label:{_FIRST - 2}s}"

@@ -82,7 +82,7 @@ def main(argv: list[str] | None = None) -> int:
 def deploy(options: DeployOptions) -> dict[str, Any]:
     """Run, print the table, write what was asked for, and return the result."""
     from cotap.agents.checkpoint import write_json
-    from cotap.deployment.controller import law_config, robot_of
+    from cotap.deployment.controller import command_config, law_config, robot_of
     from cotap.deployment.keyboard import HELP, KeyboardPilot, raw_terminal
     from cotap.deployment.policy import OnnxPolicy
     from cotap.deployment.trials import report, run_trials
@@ -117,7 +117,7 @@ def deploy(options: DeployOptions) -> dict[str, Any]:
     if options.passive:
         make_passive(laws)
     laws.check()
-    pilot = KeyboardPilot(spec.nominal_height_m) if options.keyboard else None
+    pilot = KeyboardPilot(spec.nominal_height_m, command_config(policy.metadata)) if options.keyboard else None
     if pilot:
         scenario.command = (TimedCommand(stand=True),)
     started = time.perf_counter()

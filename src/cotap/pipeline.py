@@ -21,7 +21,7 @@ class PipelineOptions:
     `cotap train base --help`, `cotap train distill --help`."""
 
     run_dir: str = ""
-    """Folder of both runs. By default runs/cotap-DATE-TIME. It gets the folders `base` and `distill`."""
+    """Folder of both runs, by default runs/cotap-DATE-TIME. It gets the folders `base` and `distill`."""
     robot: str = "h1"
     """Name of the robot."""
     quick: bool = False

@@ -27,6 +27,7 @@ from cotap.deployment.robot import Perturbations, Robot
 from cotap.deployment.safety import SafetyConfig, Watchdog
 from cotap.deployment.scenario import ArmMotion, Scenario, TimedCommand, load_scenario
 from cotap.deployment.trial import Trial, run_trial, start_up, trajectory
+from cotap.deployment.trials import report
 from cotap.envs.commands import CommandConfig
 from cotap.envs.scripted_forces import ForceProfile
 from cotap.envs.upper_body import UpperBodyConfig
@@ -34,6 +35,10 @@ from cotap.motions import MotionLibrary, shipped_library
 
 FAST = EngineConfig(timestep=0.01, collision="feet", cone="pyramidal")
 FREE = np.zeros((2, 3))
+
+TRAINED = CommandConfig(
+    velocity_x=(-1.0, 1.0), velocity_y=(-0.5, 0.5), yaw_rate=(-0.8, 0.8), height_offset=(-0.2, 0.02)
+)
 
 
 def make_robot(spec, perturbations: Perturbations | None = None) -> Robot:
@@ -293,11 +298,25 @@ def test_a_short_trial_is_padded_as_fallen(policy, spec):
     assert t.alive().tolist() == [[True, k < 4] for k in range(10)]
 
 
-def test_a_trial_that_diverged_is_padded_as_fallen(policy, spec):
+def test_a_trial_that_diverged_is_padded_as_fallen(policy, policy_file, spec):
     robot, controller = make_robot(spec), make_controller(policy, spec)
     trial = run_trial(robot, controller, Scenario(0.1, command=(TimedCommand(stand=True),)), SafetyConfig(ramp_s=0.0))
     trial.fell = True  # in a step of which there is no row
     assert trajectory([trial], 10).alive()[:, 0].tolist() == [k < 5 for k in range(10)]
+    assert _measured([trial], policy, policy_file)["episode_length_fraction"] == pytest.approx(0.5)
+    assert _measured([trial], policy, policy_file)["fall_fraction"] == 1.0
+    trial.fell = False  # a pilot has had enough
+    assert _measured([trial], policy, policy_file)["episode_length_fraction"] == pytest.approx(1.0)
+    assert _measured([trial], policy, policy_file)["fall_fraction"] == 0.0
+
+
+def _measured(trials, policy, path):
+    """Means of what `report` says of these trials of a scenario of 0.2 s."""
+    content = report(
+        trials, path, policy, law_config(policy.metadata), EngineConfig(), Perturbations(), SafetyConfig(),
+        Scenario(0.2), 0, 0.0,
+    )  # fmt: skip
+    return {name: part["mean"] for name, part in content["metrics"].items()}
 
 
 def test_random_directions_are_drawn_from_the_trials_seed(spec):
@@ -515,7 +534,8 @@ def test_the_trained_law_is_the_default(policy):
     laws = law_config(dataclasses.replace(policy.metadata, law=other))
     assert (laws.singularity_ratio, laws.torso.model) == (False, "constant")
     weaker = [0.5 * limit for limit in policy.metadata.torque_limit_nm]  # as `torque_limit_scale` makes them
-    robot_of(dataclasses.replace(policy.metadata, torque_limit_nm=weaker))
+    limited = robot_of(dataclasses.replace(policy.metadata, torque_limit_nm=weaker))
+    assert [joint.torque_limit_nm for joint in limited.joints] == weaker
     with pytest.raises(PolicyError, match="h2"):
         robot_of(dataclasses.replace(policy.metadata, robot="h2"))
 
@@ -527,7 +547,7 @@ def test_the_trained_law_is_the_default(policy):
      ("f", (0.0, 0.0), 0.0, -0.02, -0.2), ("r", (0.0, 0.0), 0.0, 0.0, 0.0)],
 )  # fmt: skip
 def test_each_key_changes_one_thing_up_to_its_limit(key, velocity, yaw_rate, height, far):
-    stick = Stick()
+    stick = Stick(TRAINED)
     command = stick.press(key)
     stands = velocity == (0.0, 0.0) and yaw_rate == 0.0
     assert command == TimedCommand(velocity=velocity, yaw_rate=yaw_rate, stand=stands, height_offset=height)
@@ -539,7 +559,7 @@ def test_each_key_changes_one_thing_up_to_its_limit(key, velocity, yaw_rate, hei
 
 
 def test_height_is_commanded_in_stance_and_speed_while_walking():
-    stick = Stick()
+    stick = Stick(TRAINED)
     for key in "fff":
         stick.press(key)
     assert stick.press("r").height_offset == -0.04
@@ -596,7 +616,7 @@ def test_a_ramp_of_no_step_still_settles(ramp_s, held, policy, spec, monkeypatch
 
 
 def test_keys_build_up_commands():
-    stick = Stick()
+    stick = Stick(TRAINED)
     for key in "wwwa":
         command = stick.press(key)
     assert (command.velocity, command.yaw_rate, command.stand) == ((0.3, 0.0), 0.1, False)

@@ -34,7 +34,7 @@ def laws_named(name: str) -> UpperBodyConfig:
 
 
 def held_env(checkpoint, laws: UpperBodyConfig) -> HumanoidEnv:
-    """One robot in the air that walks for a second and is then asked to stand, forces on its hands."""
+    """One robot in the air that walks for a fifth of a second and is then asked to stand, forces on its hands."""
     cfg = load_policy(checkpoint).env_config
     cfg.fixed_base, cfg.upper_body, cfg.collision = True, laws, "feet"
     cfg.randomization.enabled = False

@@ -206,4 +206,4 @@ def test_that_pybullet_is_not_installed_is_said(checkpoint_of, monkeypatch, caps
     monkeypatch.setattr(builtins, "__import__", without)
     arguments = ["--engine", "pybullet", "--num-envs", "1", "--checkpoint", str(checkpoint_of())]
     assert main(["tour", *arguments]) == 2
-    assert "pip install 'cotap[pybullet]'" in capsys.readouterr().err
+    assert "pip install -e '.[pybullet]'" in capsys.readouterr().err

@@ -45,9 +45,17 @@ def test_hands_by_name(hand, pushed):
 
 def test_a_swinging_force_by_hand():
     forces = ScriptedForces(ForceProfile((30.0, 0.0, 0.0), "both", 1.0, period_s=4.0), SIDES, 3, DT)
-    x = forces.at(torch.tensor([2.0, 3.0, 4.0]))[:, 0, 0]
+    x = forces.at(torch.tensor([2.0, 3.0, 4.0]) - DT / 2)[:, 0, 0]  # it counts in the middle of a step
     torch.testing.assert_close(x, torch.tensor([30.0, 0.0, -30.0]), atol=1e-4, rtol=0)
     assert not forces.at(torch.tensor([0.5, 0.5, 0.5])).any()
+
+
+@pytest.mark.parametrize("hours", [0, 1, 24, 270])
+def test_a_force_without_end_stays_the_same(hours):
+    """Single precision has steps of 0.06 s after 270 hours."""
+    forces = ScriptedForces(ForceProfile((60.0, 0.0, 0.0), "both", 0.0, 1e6), SIDES, 50, DT)
+    steps = hours * 180_000 + torch.arange(50)
+    assert (forces.at(DT * steps.double())[:, 0, 0] == 60.0).all()
 
 
 def test_random_directions_turn_about_the_vertical(rng):

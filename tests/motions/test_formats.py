@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gzip
 import io
 import json
@@ -18,6 +19,7 @@ from cotap.motions import MotionClip, MotionError, MotionLibrary
 from cotap.motions.formats import FORMATS, detect_format
 from cotap.motions.importer import import_motions
 from cotap.motions.joblib_files import load_joblib
+from cotap.motions.library import shipped_library
 from cotap.motions.retarget import arm_frames
 
 SECONDS = 3.0
@@ -414,3 +416,23 @@ def test_unknown_suffixes_are_named(tmp_path):
     with pytest.raises(MotionError, match=r"no known suffix; known: \.txt"):
         detect_format(path)
     assert set(FORMATS) == {"deepmimic", "amass", "phc", "lafan", "npz"}
+
+
+def test_a_library_keeps_whose_its_clips_are_and_has_no_image_twice(tmp_path, spec):
+    shipped_library(spec).select(["dance_b", "dance_b_mirrored", "punch"], spec).save(tmp_path / "three.npz")
+    result = import_motions([tmp_path / "three.npz"], spec, mirror=True, source="me", licence="mine", progress=False)
+    assert [c.name for c in result.clips] == ["dance_b", "dance_b_mirrored", "punch", "punch_mirrored"]
+    assert [c.mirrored for c in result.clips] == [False, True, False, True]
+    of = {c.name: c for c in shipped_library(spec).clips}
+    for clip in result.clips:
+        origin = of[clip.name]
+        assert (clip.source, clip.licence) == (origin.source, origin.licence)
+
+
+def test_a_name_that_grows_too_long_costs_its_own_clip_only(tmp_path, spec):
+    punch = shipped_library(spec).select(["punch"], spec).clips[0]
+    for stem in ("good", "x" * 195):
+        MotionLibrary([dataclasses.replace(punch, name=stem)], spec).save(tmp_path / f"{stem[:9]}.npz")
+    result = import_motions([tmp_path], spec, mirror=True, progress=False)
+    assert [c.name for c in result.clips] == ["good", "good_mirrored"]
+    assert ["at most 200 characters" in reason for _, reason in result.failures] == [True]

@@ -8,7 +8,7 @@ from cotap.motions.generator import KINDS, MotionConfig, MotionGenerator
 # Of the H1, typed from the published parameters: limits less 0.1 rad, at most 1.2 rad from 0; half the speed limits.
 H1_LOW = (-1.2, -0.24, -1.2, -1.15, -1.2, -1.2, -1.2, -1.15)
 H1_HIGH = (1.2, 1.2, 1.2, 1.2, 1.2, 0.24, 1.2, 1.2)
-H1_SPEED = (4.5, 4.5, 10.0, 10.0) * 2
+H1_SPEED = (4.5,) * 8
 
 
 def bounds(spec) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -19,7 +19,7 @@ def bounds(spec) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     return (
         torch.tensor(low),
         torch.tensor(high),
-        torch.tensor([min(0.5 * j.velocity_limit_rad_s, 10.0) for j in joints]),
+        torch.tensor([min(0.5 * j.velocity_limit_rad_s, 4.5) for j in joints]),
     )
 
 

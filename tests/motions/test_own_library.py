@@ -93,7 +93,8 @@ def test_no_library_is_loaded_where_arms_hold_a_pose(name: str):
     cfg = HumanoidEnvConfig()
     cfg.motions.clips.library = "/nowhere.npz"
     protocol = PROTOCOLS[name]()
-    assert plays_clips(protocol.configure(cfg).motions.clips, h1()) == (protocol.arms == "moving")
+    # The tour moves arms itself.
+    assert plays_clips(protocol.configure(cfg).motions.clips, h1()) == (protocol.arms == "moving" and name != "tour")
 
 
 def test_a_policy_whose_library_is_gone_can_be_evaluated(library: Path, trained: Path, capsys):

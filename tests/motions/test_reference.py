@@ -16,7 +16,6 @@ from cotap.motions.library import has_shipped_library
 from cotap.motions.reference import ClipConfig, ReferenceConfig, ReferenceMotion, load_clips
 
 DT = 0.02
-WIDE = (torch.full((8,), -10.0), torch.full((8,), 10.0))
 
 
 def made_clip(name: str, level: float, frames: int = 51, slope: float = 0.0, root=None) -> MotionClip:
@@ -31,7 +30,7 @@ def everyone(n: int) -> torch.Tensor:
 
 
 def player(spec, clips, num_envs=4, dt=DT) -> ClipPlayer:
-    return ClipPlayer(MotionLibrary(clips, spec), *WIDE, num_envs, dt)
+    return ClipPlayer(MotionLibrary(clips, spec), num_envs, dt)
 
 
 def test_the_player_reads_its_own_clip_between_frames_and_starts_again(spec):

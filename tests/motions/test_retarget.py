@@ -131,3 +131,13 @@ def test_an_arm_of_another_kind_is_refused(spec):
     joints = tuple(replace(j, axis=(0.0, 0.0, 1.0)) if j.name == "left_elbow" else j for j in spec.joints)
     with pytest.raises(ValueError, match="left arm does not begin with shoulder pitch, roll, yaw and elbow"):
         arm_frames(replace(spec, joints=joints), spec.arms[0])
+
+
+def test_an_arm_that_is_straight_at_zero_is_refused(spec):
+    """Its forearm would be sent up or back, a quarter turn from where it should be."""
+    from dataclasses import replace
+
+    turned = (0.5**0.5, 0.0, 0.5**0.5, 0.0)
+    bodies = tuple(replace(b, quat=turned) if b.joint == "left_elbow" else b for b in spec.bodies)
+    with pytest.raises(ValueError, match=r"the left upper arm must point down and the forearm forward, .*turned"):
+        arm_frames(replace(spec, bodies=bodies), spec.arms[0])

@@ -9,6 +9,7 @@ from cotap.play.controls import Ranges, make_controls
 from cotap.play.rules import consistent, without_effect
 
 STILL = {"velocity_x": 0.0, "velocity_y": 0.0, "yaw_rate": 0.0}
+UPRIGHT = {"stand": False, "height_offset": 0.0}
 
 
 def controls(**changes):
@@ -26,11 +27,14 @@ def idle(changes, **ranges):
 
 @pytest.mark.parametrize(
     ("asked", "becomes"),
-    [({"velocity_y": 0.1}, {"velocity_y": 0.1, "stand": False}), ({"yaw_rate": 0.0}, {"yaw_rate": 0.0}),
-     ({"stand": True, "velocity_x": 0.4}, {"stand": True, **STILL}), ({"stand": False}, {"stand": False}),
-     ({"stand": True}, {"stand": True, **STILL}), ({"speed": 2.0}, {"speed": 2.0}), ({}, {})],
+    [({"velocity_y": 0.1}, {"velocity_y": 0.1, **UPRIGHT}), ({"yaw_rate": 0.0}, {"yaw_rate": 0.0}),
+     ({"stand": True, "velocity_x": 0.4}, {"stand": True, **STILL}), ({"stand": False}, UPRIGHT),
+     ({"stand": True}, {"stand": True, **STILL}), ({"speed": 2.0}, {"speed": 2.0}), ({}, {}),
+     ({"height_offset": -0.1}, {"height_offset": -0.1, "stand": True, **STILL}),
+     ({"height_offset": 0.0}, {"height_offset": 0.0}),
+     ({"height_offset": -0.1, "velocity_x": 0.4}, {"height_offset": -0.1, "stand": True, **STILL})],
 )  # fmt: skip
-def test_standing_and_velocities_end_each_other(asked, becomes):
+def test_standing_and_walking_end_each_other(asked, becomes):
     assert consistent(asked) == becomes
 
 

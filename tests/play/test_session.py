@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+
 import numpy as np
 import pytest
 import torch
@@ -62,11 +64,13 @@ def test_commands_reach_the_robots_and_standing_ends_them(session):
     assert command.velocity_h.tolist() == pytest.approx(np.array([[0.6, 0.0]] * 2))
     assert command.yaw_rate.tolist() == pytest.approx([-0.3] * 2)
     assert command.stand.tolist() == [0.0] * 2
-    assert command.height.tolist() == pytest.approx([session.env.spec.nominal_height_m - 0.1] * 2)
+    assert command.height.tolist() == pytest.approx([session.env.spec.nominal_height_m] * 2)  # no squat that walks
     session.set({"stand": True})
     run(session, 25)
     assert session.env.commands.asked_to_stand.all()
     assert session.env.commands.current().velocity_h.abs().max() == 0.0
+    height = session.env.commands.current().height
+    assert height.tolist() == pytest.approx([session.env.spec.nominal_height_m - 0.1] * 2)
 
 
 def test_motion_is_led_and_comes_back(session):
@@ -100,13 +104,35 @@ def test_a_checkpoint_that_cannot_be_used_is_put_back_and_a_notice_says_so(sessi
 
 def test_a_fallen_robot_is_back_on_its_feet_and_counted(session):
     falls = list(session.falls)
+    before = session.step()
     session.env.sim.qpos[1, 2:7] = torch.tensor([0.6, 0.5**0.5, 0.0, 0.5**0.5, 0.0])  # on its face
     sample = session.step()
     assert sample["fell"].tolist() == [False, True]
+    for name in sample.keys() - {"fell"}:  # of the fallen one the step before is shown
+        np.testing.assert_array_equal(sample[name][1], before[name][1])
+    assert (sample["qpos"][0] != before["qpos"][0]).any()
     assert [b - a for a, b in zip(falls, session.falls, strict=True)] == [0, 1]
     sample = session.step()
     assert sample["height"][1] > 0.9
     assert sample["heading_w"][1, 0, 0] > 0.99
+
+
+def test_a_robot_whose_simulation_diverged_is_shown_as_it_was(session):
+    before = session.step()
+    session.env.sim.qvel[1] = 1e12
+    sample = session.step()
+    assert sample["fell"].tolist() == [False, True]
+    np.testing.assert_array_equal(sample["hand_w"][1], before["hand_w"][1])
+    for name in ("hand_w", "qpos", "velocity", "effective_stiffness", "stiffness_eigenvalues"):
+        assert np.isfinite(sample[name]).all(), name
+
+
+def test_a_recording_names_the_policy_that_runs_though_its_file_is_gone(tmp_path):
+    path = save_random_policy(tmp_path / "p.pt")
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    session = Session({"mine": path})
+    path.unlink()
+    assert session.describe()["checkpoints_sha256"] == {"a": digest, "b": digest}
 
 
 def test_effective_stiffness_against_the_closed_form_of_a_square_jacobian():

@@ -17,7 +17,7 @@ from robots.third import mjcf
 from cotap.agents.checkpoint import load_checkpoint
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.robots import ROBOTS
-from cotap.robots.from_mjcf import facts_of, facts_text, main
+from cotap.robots.from_mjcf import _torque_limit, facts_of, facts_text, main
 from cotap.robots.kinematics import default_angles
 from cotap.robots.mjcf import build_mjspec, build_model
 
@@ -151,6 +151,10 @@ LONE = '<body name="odd"><joint name="odd" axis="0 1 0" range="-9 9" actuatorfrc
         ),
         (mjcf(base=LONE.replace(' range="-9 9"', "")), "joint 'odd' needs a range"),
         (mjcf(base=LONE.replace(' actuatorfrcrange="-1 1"', "")), "joint 'odd' needs a torque limit"),
+        (
+            mjcf(base=LONE.replace("<joint", '<joint stiffness="40"')),
+            "joint 'odd' must have no spring, got stiffness 40",
+        ),
         (mjcf(base=LONE.replace("<joint", '<joint pos="0 0 0.1"')), "'odd' must lie in its body's origin"),
         (
             mjcf(base=LONE.replace("<joint", '<joint ref="5"')),
@@ -211,3 +215,21 @@ def test_what_is_no_file_or_names_what_a_terminal_obeys_is_refused_in_words(tmp_
     assert "one body of the world must carry the robot" in said
     assert "\x1b" not in said
     assert len(said) < 3500
+
+
+@pytest.mark.parametrize(
+    ("of_joint", "actuator", "limit"),
+    [('actuatorfrcrange="-80 80"', 'forcerange="-25 25"', 25.0),
+     ('actuatorfrcrange="-20 20"', 'forcerange="-25 25"', 20.0),
+     ("", 'forcerange="-5 5" gear="3"', 15.0), ("", 'ctrlrange="-7 7" gear="2"', 14.0)],
+)  # fmt: skip
+def test_the_least_of_all_torque_limits_counts(of_joint, actuator, limit):
+    """MuJoCo applies both: that of the actuator, then that of the joint."""
+    text = f"""<mujoco><worldbody><body><joint name="a" axis="0 1 0" {of_joint}/><geom size="0.1"/></body></worldbody>
+    <actuator><motor joint="a" {actuator}/></actuator></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(text)
+    assert _torque_limit(model, 0) == pytest.approx(limit)
+    data = mujoco.MjData(model)
+    data.ctrl[0] = 1e3
+    mujoco.mj_forward(model, data)
+    assert data.qfrc_actuator[0] == pytest.approx(limit)

@@ -69,18 +69,18 @@ def test_mjbatch_is_used_beside_its_own_mujoco_alone(machine):
 
 def test_mjbatch_that_is_not_installed_is_named(machine, capsys):
     machine(False, False, mjbatch=False)
-    with pytest.raises(ValueError, match=r"backend 'mjbatch' needs mjbatch, .* pip install cotap\[mjbatch\]"):
+    with pytest.raises(ValueError, match=r"backend 'mjbatch' needs mjbatch, .* pip install -e '\.\[mjbatch\]'"):
         HumanoidEnv(HumanoidEnvConfig(num_envs=1, backend="mjbatch"))
     assert train(["base", "--backend", "mjbatch", "--num-envs", "2"]) == 2
-    assert "pip install cotap[mjbatch]" in capsys.readouterr().err
+    assert "pip install -e '.[mjbatch]'" in capsys.readouterr().err
 
 
 def test_warp_that_is_not_installed_is_named(machine, capsys, tmp_path):
     policy = str(save_random_policy(tmp_path / "policy.pt"))
     machine(True, False)
-    with pytest.raises(ValueError, match=r"backend 'warp' needs mujoco_warp, .* pip install cotap\[warp\]"):
+    with pytest.raises(ValueError, match=r"backend 'warp' needs mujoco_warp, .* pip install -e '\.\[warp\]'"):
         resolve_backend("warp")
-    with pytest.raises(ValueError, match=r"pip install cotap\[warp\]"):
+    with pytest.raises(ValueError, match=r"pip install -e '\.\[warp\]'"):
         HumanoidEnv(HumanoidEnvConfig(num_envs=1, backend="warp"))
     for command, args in (
         (train, ["base", "--backend", "warp", "--num-envs", "2"]),
@@ -88,7 +88,7 @@ def test_warp_that_is_not_installed_is_named(machine, capsys, tmp_path):
         (evaluate, ["impact", "--checkpoint", policy, "--backend", "warp", "--num-envs", "2"]),
     ):
         assert command(args) == 2
-        assert "pip install cotap[warp]" in capsys.readouterr().err
+        assert "pip install -e '.[warp]'" in capsys.readouterr().err
 
 
 def test_unknown_backends_are_refused(capsys):

@@ -42,7 +42,7 @@ class Readings:
 
 
 def robot_of(metadata: PolicyMetadata) -> RobotSpec:
-    """The robot that a policy is for.
+    """The robot that a policy is for, with the torque limits that it was trained with.
 
     Raises:
         PolicyError: cotap does not know it, or knows it with another value of an entry that is the robot's own.
@@ -70,7 +70,10 @@ def robot_of(metadata: PolicyMetadata) -> RobotSpec:
             f"the policy was trained on a {spec.name} with other torque_limit_nm: {metadata.torque_limit_nm}, "
             f"not one factor times {limits.tolist()}"
         )
-    return spec
+    joints = (
+        dataclasses.replace(j, torque_limit_nm=t) for j, t in zip(spec.joints, metadata.torque_limit_nm, strict=True)
+    )
+    return dataclasses.replace(spec, joints=tuple(joints))
 
 
 def observed_terms(metadata: PolicyMetadata, spec: RobotSpec) -> tuple[Term, ...]:
@@ -192,14 +195,16 @@ class Controller:
         found = self._policy(self._history.append(present, fresh)[0].numpy())
         targets, wanted = np.split(found, [len(self._action)])
         seen = observed[0].double().numpy()
-        if self._raw_arms:
-            targets[self._num_lower :] = seen
         self._modulate(torch.from_numpy(wanted)[None])
         self._action = self._policy.action(targets, seen)
         self.motion.step(self._rng)
         reference = self.motion.current()
         # The arms are sent where the reference will be at the step's end, not where it was observed.
-        targets += self._policy.offset(reference.position[0].double().numpy()) - self._policy.offset(seen)
+        coming = reference.position[0].double().numpy()
+        targets += self._policy.offset(coming) - self._policy.offset(seen)
+        if self._raw_arms:
+            targets[self._num_lower :] = coming
+            self._action = self._policy.action(targets, coming)
         self.targets = targets
         law = pd_law(self._kp, self._kd, targets)
         if not self.upper_body.active:

@@ -10,20 +10,24 @@ from contextlib import contextmanager
 
 from cotap.deployment.controller import Controller
 from cotap.deployment.scenario import TimedCommand
+from cotap.envs.commands import CommandConfig
 
 HELP = "w/s faster/slower, a/d turn left/right, q/e step left/right, r/f higher/lower, space stand, x end"
 _STEPS = {
     "w": ("forward", 0.1), "s": ("forward", -0.1), "q": ("leftward", 0.1), "e": ("leftward", -0.1),
     "a": ("yaw_rate", 0.1), "d": ("yaw_rate", -0.1), "r": ("height_offset", 0.02), "f": ("height_offset", -0.02),
 }  # fmt: skip
-_LIMITS = {"forward": (-1.0, 1.0), "leftward": (-0.5, 0.5), "yaw_rate": (-0.8, 0.8), "height_offset": (-0.2, 0.0)}
 
 
 class Stick:
-    """What has been asked for so far."""
+    """What has been asked for so far, within the ranges of training."""
 
-    def __init__(self) -> None:
-        self._value = dict.fromkeys(_LIMITS, 0.0)
+    def __init__(self, trained: CommandConfig) -> None:
+        self._limits = {
+            "forward": trained.velocity_x, "leftward": trained.velocity_y, "yaw_rate": trained.yaw_rate,
+            "height_offset": (trained.height_offset[0], 0.0),
+        }  # fmt: skip
+        self._value = dict.fromkeys(self._limits, 0.0)
         self.ended = False
 
     def press(self, key: str) -> TimedCommand:
@@ -31,13 +35,13 @@ class Stick:
         if key == "x":
             self.ended = True
         elif key == " ":
-            self._value = dict.fromkeys(_LIMITS, 0.0)
+            self._value = dict.fromkeys(self._limits, 0.0)
         elif key in _STEPS:
             name, step = _STEPS[key]
-            low, high = _LIMITS[name]
+            low, high = self._limits[name]
             self._value[name] = min(high, max(low, round(self._value[name] + step, 3)))
             # Height is commanded in stance, speed while walking.
-            for other in _LIMITS:
+            for other in self._limits:
                 if (other == "height_offset") != (name == "height_offset"):
                     self._value[other] = 0.0
         v = self._value
@@ -48,8 +52,8 @@ class Stick:
 class KeyboardPilot:
     """Reads keys at every control step, and keeps the loop to the clock on the wall."""
 
-    def __init__(self, nominal_height_m: float) -> None:
-        self._stick, self._nominal, self._start = Stick(), nominal_height_m, 0.0
+    def __init__(self, nominal_height_m: float, trained: CommandConfig) -> None:
+        self._stick, self._nominal, self._start = Stick(trained), nominal_height_m, 0.0
 
     def __call__(self, controller: Controller, time_s: float) -> bool:
         """As `cotap.deployment.trial.Pilot`."""

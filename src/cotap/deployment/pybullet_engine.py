@@ -31,7 +31,7 @@ class PybulletEngine:
             from pybullet_utils.bullet_client import BulletClient
         except ModuleNotFoundError as error:
             raise ModuleNotFoundError(
-                "the engine pybullet is not installed; install it with: pip install 'cotap[pybullet]'"
+                "the engine pybullet is not installed; in cotap's folder, pip install -e '.[pybullet]'"
             ) from error
         self._model, self._names = with_rotors(spec), pybullet
         self._limit = cfg.torque_limit_scale * np.array([j.torque_limit_nm for j in spec.joints])

@@ -55,6 +55,8 @@ class TimedCommand:
             raise ValueError(f"{where}.stand must be true or false, got {quoted(self.stand)}")
         if self.stand and (any(self.velocity) or self.yaw_rate):
             raise ValueError(f"{where} stands and moves: velocity {self.velocity}, yaw_rate {self.yaw_rate}")
+        if self.height_offset and not self.stand:
+            raise ValueError(f"{where}.height_offset must be 0 where stand is false, got {self.height_offset}")
 
     def give(self, commands: CommandSource, nominal_height_m: float) -> None:
         """Hand this command over."""

@@ -62,7 +62,8 @@ def report(
     recorded = [trial for trial in trials if trial.rows]
     measures: dict[str, torch.Tensor] = {}
     if recorded:
-        steps = min(steps, max(len(trial.rows) for trial in recorded))
+        # A pilot may have ended the trials that stand; those that fell are fallen to the scenario's end.
+        steps = max((len(trial.rows) for trial in recorded if not trial.fell), default=steps)
         measures = tracking_measures(trajectory(recorded, steps), gait_config(policy.metadata).period_s)
         measures.pop("e_path")
     return {

@@ -24,7 +24,8 @@ class CommandConfig:
     yaw_rate: tuple[float, float] = (-0.9, 0.9)
     """Turning rate, positive to the left [rad/s]."""
     height_offset: tuple[float, float] = (-0.22, 0.02)
-    """Torso height relative to nominal while standing [m]; a robot that walks keeps nominal height."""
+    """Torso height relative to nominal while standing [m]. It is approached at once, so that a
+    robot that walked steps on the spot while it goes down; one that walks again comes up as it sets out."""
     stand_probability: float = 0.25
     """Share of commands that ask the robot to stand."""
     axis_zero_probability: float = 0.2
@@ -84,6 +85,7 @@ class CommandSource(Stateful):
         self._target = torch.zeros(num_envs, 5)
         self._target[:, 4] = nominal_height_m
         self._velocity = torch.zeros(num_envs, 3)
+        self._walking_ranges = torch.tensor([cfg.velocity_x, cfg.velocity_y, cfg.yaw_rate]).unbind(1)
         self._rate = dt * torch.tensor([cfg.acceleration, cfg.acceleration, cfg.yaw_acceleration])
         self._height = torch.full((num_envs,), nominal_height_m)
         self._remaining_s = torch.zeros(num_envs)
@@ -115,8 +117,10 @@ class CommandSource(Stateful):
         self._target = target.to(self._velocity.device)
 
     def set_velocity(self, velocity: torch.Tensor, yaw_rate: torch.Tensor, mask: torch.Tensor) -> None:
-        """In the envs of `mask` (N,), walk at these velocities (N, 2) and yaw rates (N,), at once."""
-        walk = torch.cat((velocity, yaw_rate.unsqueeze(1)), 1)
+        """In the envs of `mask` (N,), walk at these velocities (N, 2) and yaw rates (N,), at once; where they are
+        beyond the ranges that commands are drawn from, at those ranges' ends."""
+        low, high = self._walking_ranges
+        walk = torch.cat((velocity, yaw_rate.unsqueeze(1)), 1).clamp(low, high)
         still = torch.tensor([0.0, self._nominal], device=walk.device).expand(len(walk), 2)
         self._target = torch.where(mask.unsqueeze(1), torch.cat((walk, still), 1), self._target)
         self._velocity = torch.where(mask.unsqueeze(1), walk, self._velocity)

@@ -215,7 +215,7 @@ class HumanoidEnv(VecEnv):
         self.upper_body.modulate(laws)
         self.actuation.send(self.state, self.joint_targets(joints, reference.position), reference.velocity)
         xfrc = self.sim.xfrc
-        self.forces.apply(xfrc, self.state, self.dt * self.episode_length_buf, self.curriculum.samples)
+        self.forces.apply(xfrc, self.state, self.dt * self.episode_length_buf.double(), self.curriculum.samples)
         if share := self.cfg.assist.share(self.samples):
             xfrc[:, self._torso] += share * self._assist(self.state, self.commands.current()).to(xfrc)
 

@@ -98,4 +98,4 @@ class Punches:
         begin, end = since.clamp(0.0, cfg.duration_s), (since + self._dt).clamp(0.0, cfg.duration_s)
         share = (end - begin) / self._dt * (segment < cfg.count)
         row = torch.arange(len(time_s), device=time_s.device), segment.clamp_max(cfg.count - 1)
-        return self.joint[row], share.unsqueeze(1) * self.force_w[row]
+        return self.joint[row], share.to(self.force_w).unsqueeze(1) * self.force_w[row]

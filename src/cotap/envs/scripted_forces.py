@@ -73,13 +73,13 @@ class ScriptedForces(Stateful):
         """Forces (N, H + 1, 3) [N] on hands and base, heading frame.
 
         They are means over the control steps that begin at `time_s` (N,) since each env's start [s], so that the
-        impulse is exact whatever the step.
+        impulse is exact whatever the step; a periodic force is that of the step's middle.
         """
-        since = time_s - self.cfg.start_s
+        since = time_s.double() - self.cfg.start_s
         end = (since + self._dt).clamp(0.0, self.cfg.duration_s)
         share = (end - since.clamp(0.0, self.cfg.duration_s)) / self._dt
         # Times are rounded; a force must neither miss its first step nor linger in one more.
         share = (1e4 * share).round() / 1e4
         if self.cfg.period_s > 0.0:
-            share = share * torch.sin(2.0 * math.pi * since / self.cfg.period_s)
-        return share[:, None, None] * self.amplitude_h
+            share = share * torch.sin(2.0 * math.pi * (since + 0.5 * self._dt) / self.cfg.period_s)
+        return share.to(self.amplitude_h)[:, None, None] * self.amplitude_h

@@ -79,7 +79,7 @@ class UpperBodyConfig:
     sampling: LawSampling = field(default_factory=LawSampling)
     modulation: ModulationConfig = field(default_factory=ModulationConfig)
     singularity_ratio: bool = True
-    """Whether compliance gives way to PD near singular arms (paper, equation 9); False for its ablation, the paper's
+    """Whether compliance gives way to PD near singular arms (paper, equation 10); False for its ablation, the paper's
     law without it."""
 
     def check(self) -> None:

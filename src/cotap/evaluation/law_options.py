@@ -51,7 +51,7 @@ class LawOptions:
     right: str = ""
     """A law for the right arm alone."""
     singularity_ratio: bool | None = None
-    """Whether to go back to PD near singular arms (paper, equation 9)."""
+    """Whether to go back to PD near singular arms (paper, equation 10)."""
 
     def configure(self, trained: UpperBodyConfig | None = None) -> UpperBodyConfig:
         """The config of the arms, for a policy that was trained with `trained`.

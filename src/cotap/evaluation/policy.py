@@ -83,7 +83,12 @@ def require_robot(checkpoint: str, own: str, robot: str) -> None:
 
 def find_checkpoint(given: str) -> Path:
     """The file that is meant by a path or by the name of a shipped one. Raises ValueError for a name not shipped."""
-    return shipped_checkpoint(given) if given in CHECKPOINTS else Path(given)
+    path = Path(given)
+    if given in CHECKPOINTS:
+        return shipped_checkpoint(given)
+    if not path.exists() and path.name == given and not path.suffix:
+        raise ValueError(f"checkpoint {quoted(given)} does not exist; shipped are: {', '.join(shipped_names())}")
+    return path
 
 
 @dataclass(frozen=True)

@@ -13,21 +13,19 @@ class ClipPlayer(Stateful):
 
     Args:
         library: The clips.
-        low: (U,) lowest joint angles played [rad].
-        high: (U,) highest.
         num_envs: Number of envs.
         dt: Control step [s].
     """
 
     STATE = ("clip", "_frame")
 
-    def __init__(self, library: MotionLibrary, low: torch.Tensor, high: torch.Tensor, num_envs: int, dt: float) -> None:
+    def __init__(self, library: MotionLibrary, num_envs: int, dt: float) -> None:
         self._advance = dt * FPS
         self.names = library.names()
         lengths = torch.tensor([len(c.arms) for c in library.clips])
         self._last = (lengths - 1).float()
         self._start = lengths.cumsum(0) - lengths
-        self._frames = torch.cat([torch.as_tensor(c.arms) for c in library.clips]).clamp(low, high)
+        self._frames = torch.cat([torch.as_tensor(c.arms) for c in library.clips])
         self._root_velocity = torch.cat([root_velocity(torch.as_tensor(c.root)) for c in library.clips])
         self.clip = torch.zeros(num_envs, dtype=torch.long)
         self._frame = torch.zeros(num_envs)

@@ -105,7 +105,9 @@ def read_library(path: Path, spec: RobotSpec, fps: float | None = None) -> Clips
     if fps is not None:
         raise MotionError(f"{str(path)!r} is a motion library, which is at {FPS:g} Hz; --fps is for other formats")
     library = MotionLibrary.load(path, spec)
-    return [(c.name, lambda c=c: _from_clip(c)) for c in library.clips]
+    names = set(library.names())
+    images = {c.name: c.mirrored or f"{c.name}_mirrored" in names for c in library.clips}
+    return [(c.name, lambda c=c: _from_clip(c, images[c.name])) for c in library.clips]
 
 
 FORMATS: dict[str, Reader] = {
@@ -141,8 +143,10 @@ def detect_format(path: Path) -> str:
     raise MotionError(f"{str(path)!r} has no known suffix; known: {', '.join(SUFFIXES)}")
 
 
-def _from_clip(clip: MotionClip) -> JointMotion:
-    return JointMotion(clip.name, np.arange(len(clip.arms)) / FPS, clip.arms.astype(float), clip.root.astype(float))
+def _from_clip(clip: MotionClip, has_image: bool) -> JointMotion:
+    times_s = np.arange(len(clip.arms)) / FPS
+    arms, root = clip.arms.astype(float), clip.root.astype(float)
+    return JointMotion(clip.name, times_s, arms, root, clip=clip, has_image=has_image)
 
 
 def _from_human(spec: RobotSpec, human: HumanMotion) -> JointMotion:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from cotap.checks import legible
 from cotap.motions.formats import FASTEST_FPS, FORMATS, SLOWEST_FPS, SUFFIXES, detect_format
-from cotap.motions.library import MotionClip, MotionError, MotionLibrary
+from cotap.motions.library import MotionClip, MotionError, MotionLibrary, check_clip
 from cotap.motions.processing import JointMotion, make_clip, mirror_clip
 from cotap.motions.quality import ClipQuality, assess, peak_speed, root_peaks
 from cotap.robots import RobotSpec
@@ -58,9 +58,9 @@ def import_motions(
         sources: Files and folders.
         spec: The robot.
         file_format: One of `FORMATS`, or auto.
-        mirror: Add the left-right mirror image of every clip.
-        source: Where the motion comes from, kept with each clip.
-        licence: Its terms, kept with each clip.
+        mirror: Add the left-right mirror image of every clip whose own is not there.
+        source: Where the motion comes from, kept with each clip; clips of a motion library keep their own.
+        licence: Its terms; likewise.
         progress: Show a progress bar.
         fps: Frame rate [Hz] in place of what the files say.
 
@@ -77,18 +77,32 @@ def import_motions(
                 result.failures.append((label, outcome))
                 continue
             try:
-                clip, report = make_clip(spec, outcome, source, licence)
-                quality = assess(spec, outcome, clip, report)
+                made = _make(spec, outcome, source, licence, mirror, taken)
             except (ValueError, MemoryError, np.linalg.LinAlgError) as error:
                 result.failures.append((label, str(error)))
                 continue
-            clip = _renamed(clip, taken)
-            result.clips.append(clip)
+            clips, quality = made
+            taken |= {clip.name for clip in clips}
+            result.clips.extend(clips)
             result.quality.append(quality)
-            result.read.append(clip.name)
-            if mirror:
-                result.clips.append(_renamed(mirror_clip(spec, clip), taken))
+            result.read.append(clips[0].name)
     return result
+
+
+def _make(
+    spec: RobotSpec, motion: JointMotion, source: str, licence: str, mirror: bool, taken: set[str]
+) -> tuple[list[MotionClip], ClipQuality]:
+    """A motion's clip, with its mirror image if that is asked for and not there, under names that are free."""
+    clip, report = make_clip(spec, motion, source, licence)
+    quality = assess(spec, motion, clip, report)
+    if motion.clip is not None:
+        own = motion.clip
+        clip = replace(clip, source=own.source, licence=own.licence, mirrored=own.mirrored)
+    clip = _renamed(clip, taken)
+    images = [_renamed(mirror_clip(spec, clip), taken | {clip.name})] if mirror and not motion.has_image else []
+    for made in (clip, *images):
+        check_clip(made, spec)  # names have become longer
+    return [clip, *images], quality
 
 
 def _read_file(
@@ -114,10 +128,7 @@ def _renamed(clip: MotionClip, taken: set[str]) -> MotionClip:
     name, number = clip.name, 2
     while name in taken:
         name, number = f"{clip.name}_{number}", number + 1
-    taken.add(name)
-    return (
-        clip if name == clip.name else MotionClip(name, clip.arms, clip.root, clip.source, clip.licence, clip.mirrored)
-    )
+    return replace(clip, name=name)
 
 
 def table(result: ImportResult) -> str:

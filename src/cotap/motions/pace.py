@@ -13,7 +13,7 @@ _SMOOTH_FRAMES = 3
 
 
 def pace(clip: MotionClip, max_speed: np.ndarray, max_acceleration: float) -> MotionClip:
-    """The clip at a pace at which no arm joint exceeds its largest speed, nor, but for a tenth or so, acceleration.
+    """The clip at a pace at which no arm joint exceeds its largest speed or acceleration, but for a tenth.
 
     Arms and root go where they went; passages that are slow enough keep their pace.
 
@@ -29,9 +29,10 @@ def pace(clip: MotionClip, max_speed: np.ndarray, max_acceleration: float) -> Mo
     from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 
     path = CubicSpline(frames, np.concatenate((clip.arms, clip.root), 1))
+    width, low, high = clip.arms.shape[1], clip.arms.min(0), clip.arms.max(0)
     at = frames
     for _ in range(_PASSES):
-        arms = path(at)[:, : clip.arms.shape[1]]
+        arms = path(at)[:, :width].clip(low, high)  # a spline overshoots
         speed = np.abs(np.diff(arms, axis=0)) * FPS / max_speed
         acceleration = np.abs(np.diff(arms, 2, axis=0)) * FPS**2 / max_acceleration
         excess = np.maximum(1.0, speed.max(1))
@@ -46,6 +47,4 @@ def pace(clip: MotionClip, max_speed: np.ndarray, max_acceleration: float) -> Mo
         time = np.concatenate(([0.0], np.cumsum(1.0 / rate)))
         at = np.interp(np.linspace(0.0, time[-1], round(time[-1]) + 1), time, at)
     sampled = path(at).astype(np.float32)
-    width = clip.arms.shape[1]
-    arms = sampled[:, :width].clip(clip.arms.min(0), clip.arms.max(0))  # a spline overshoots
-    return replace(clip, arms=arms, root=sampled[:, width:])
+    return replace(clip, arms=sampled[:, :width].clip(low, high), root=sampled[:, width:])

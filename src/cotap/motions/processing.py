@@ -32,6 +32,10 @@ class JointMotion:
     """(T, 3) x, y [m] and heading [rad]."""
     human: HumanMotion | None = None
     """What it was retargeted from, if it was."""
+    clip: MotionClip | None = None
+    """The clip of a motion library that it is, if it is one; source, licence and mirroring stay that clip's."""
+    has_image: bool = False
+    """Whether its mirror image is there already: it lies beside it, or it is one itself."""
 
 
 @dataclass(frozen=True)

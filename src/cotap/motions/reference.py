@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -92,9 +92,12 @@ def pin_library(cfg: ClipConfig) -> None:
     cfg.library_sha256 = cfg.library_sha256 or library_sha256(cfg.library)
 
 
-def load_clips(cfg: ClipConfig, spec: RobotSpec) -> MotionLibrary:
-    """The clips that a config asks for, at its pace. Raises MotionError for a clip that is not there, and for a library
-    that is not there or has changed."""
+def load_clips(cfg: ClipConfig, spec: RobotSpec, margin_rad: float = 0.0) -> MotionLibrary:
+    """The clips that a config asks for, at its pace, with joints that stay `margin_rad` off their limits [rad].
+
+    Raises:
+        MotionError: a clip is not there, or a library is not there or has changed.
+    """
     if cfg.library and cfg.library_sha256 not in ("", library_sha256(cfg.library)):
         raise MotionError(
             f"motion library {cfg.library!r} has changed since the policy was trained with it; give the library that "
@@ -105,8 +108,12 @@ def load_clips(cfg: ClipConfig, spec: RobotSpec) -> MotionLibrary:
     if not names:
         raise MotionError("clips.held_out leaves no clip to play")
     limit = np.array([j.velocity_limit_rad_s for j in spec.upper_joint_specs])
-    clips = [pace(clip, cfg.velocity_share * limit, cfg.acceleration) for clip in library.select(names, spec).clips]
-    return MotionLibrary(clips, spec)
+    low, high = np.array([j.range_rad for j in spec.upper_joint_specs], np.float32).T
+    clips = (
+        replace(clip, arms=clip.arms.clip(low + margin_rad, high - margin_rad))
+        for clip in library.select(names, spec).clips
+    )
+    return MotionLibrary([pace(clip, cfg.velocity_share * limit, cfg.acceleration) for clip in clips], spec)
 
 
 class ReferenceMotion(Stateful):
@@ -128,9 +135,7 @@ class ReferenceMotion(Stateful):
         margin = cfg.generator.limit_margin_rad
         self._low, self._high = low + margin, high - margin
         self.clips = (
-            ClipPlayer(load_clips(cfg.clips, spec), self._low, self._high, num_envs, dt)
-            if plays_clips(cfg.clips, spec)
-            else None
+            ClipPlayer(load_clips(cfg.clips, spec, margin), num_envs, dt) if plays_clips(cfg.clips, spec) else None
         )
         limit = torch.tensor([j.velocity_limit_rad_s for j in joints])
         self._largest_step, self._blend_speed = dt * limit, cfg.clips.blend_speed * limit

@@ -11,9 +11,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from cotap.motions.elbow import elbow_index
-from cotap.robots import ArmSpec, RobotSpec
+from cotap.robots import ArmSpec, BodySpec, RobotSpec
+
+_TURNED_RAD = 0.05
+_ALONG = 0.95
+"""Cosine of a third of a radian."""
 
 
 @dataclass(frozen=True)
@@ -51,9 +56,28 @@ def arm_frames(spec: RobotSpec, arm: ArmSpec) -> ArmFrames:
         raise ValueError(
             f"{spec.name}: {arm.side} arm does not begin with shoulder pitch, roll, yaw and elbow; its axes are {axes}"
         )
+    _require_bent_at_zero(spec, arm, chain)
     tilt = 2.0 * np.arctan2(chain[0].quat[1], chain[0].quat[0])
     low, high = np.array([j.range_rad for j in joints]).T
     return ArmFrames(float(tilt), low, high)
+
+
+def _require_bent_at_zero(spec: RobotSpec, arm: ArmSpec, chain: tuple[BodySpec, ...]) -> None:
+    """Raise ValueError unless, at zero angles, the upper arm hangs down and the forearm points forward, with links from
+    the shoulder's roll to the elbow that are not turned against the torso: what the closed form takes for granted."""
+    turn, origin, origins = Rotation.identity(), np.zeros(3), []
+    straight = True
+    for number, body in enumerate(chain):
+        origin, turn = origin + turn.apply(body.pos), turn * Rotation.from_quat(body.quat, scalar_first=True)
+        origins.append(origin)
+        straight = straight and (not 1 <= number <= 3 or turn.magnitude() < _TURNED_RAD)
+    upper, fore = origins[3] - origins[1], origin + turn.apply(arm.hand_point) - origins[3]
+    bent = -upper[2] > _ALONG * np.linalg.norm(upper) and fore[0] > _ALONG * np.linalg.norm(fore)
+    if not (straight and bent):
+        raise ValueError(
+            f"{spec.name}: at zero angles the {arm.side} upper arm must point down and the forearm forward, with links "
+            f"that are not turned; they point along {np.round(upper, 2).tolist()} and {np.round(fore, 2).tolist()}"
+        )
 
 
 def elbow_angle(flexion: np.ndarray) -> np.ndarray:

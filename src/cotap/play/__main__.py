@@ -72,7 +72,9 @@ def _run(options: PlayOptions) -> int:
             from cotap.play.guard import new_token, page_url
             from cotap.play.server import open_server
     except ImportError as error:
-        raise ValueError(f"the page needs viser and mjviser ({error}): pip install 'cotap[play]'") from error
+        raise ValueError(
+            f"the page needs viser and mjviser ({error}): in cotap's folder, pip install -e '.[play]'"
+        ) from error
     with uncollected():
         fill = _replay(options) if options.replay else _live(options)
     token = new_token(options.host)

@@ -113,7 +113,7 @@ class App:
             checkpoint = changes.get(f"{robot}.checkpoint")
             if checkpoint and (text := self.session.trained_otherwise(checkpoint)):
                 self.notices.tell(text, title=f"robot {robot.upper()}: another gait")
-        if "side_by_side" in values:
+        if "side_by_side" in changes:
             self._keep_recording()
         for request in requests:
             if isinstance(request, Push):

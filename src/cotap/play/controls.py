@@ -119,13 +119,18 @@ SPEED = Number("speed", 0.1, 4.0, 1.0, 0.1)
 """How many times as fast as the clock."""
 
 
+def _command(label: str, trained: tuple[float, float], step: float) -> Number:
+    """Over the range of training, which need not hold zero: standing robots are asked for that all the same."""
+    return Number(label, min(trained[0], 0.0), max(trained[1], 0.0), 0.0, step)
+
+
 def make_controls(r: Ranges) -> dict[str, Control]:
     """Every control by name: `velocity_x`, `held.left.z`, `a.left.stiffness_x`, ..."""
     controls: dict[str, Control] = {
-        "velocity_x": Number("forward [m/s]", *r.velocity_x, 0.0, 0.05),
-        "velocity_y": Number("leftward [m/s]", *r.velocity_y, 0.0, 0.05),
-        "yaw_rate": Number("turn [rad/s]", *r.yaw_rate, 0.0, 0.05),
-        "height_offset": Number("height [m]", *r.height_offset, 0.0, 0.01),
+        "velocity_x": _command("forward [m/s]", r.velocity_x, 0.05),
+        "velocity_y": _command("leftward [m/s]", r.velocity_y, 0.05),
+        "yaw_rate": _command("turn [rad/s]", r.yaw_rate, 0.05),
+        "height_offset": _command("height [m]", r.height_offset, 0.01),
         "stand": Flag("stand", True),
         "motion": Choice("arm motion", r.motions, r.motions[0]),
         "arm_actions": Flag("policy moves arms", True),

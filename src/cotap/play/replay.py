@@ -12,6 +12,7 @@ import viser
 
 from cotap.checks import legible, quoted
 from cotap.evaluation.recording import Recording, RecordingError
+from cotap.play import ROBOTS
 from cotap.play.archive import Archive
 from cotap.play.controls import SPEED, Number, Refused
 from cotap.play.notices import Notices
@@ -54,6 +55,8 @@ class Replay:
                 f"a recording of {width} positions and the hands {quoted(sides)} is of no {spec.name!r}"
             )
         self._count = recording.trajectory.fell.shape[1]
+        if self._count > len(ROBOTS):
+            raise RecordingError(f"the page shows at most {len(ROBOTS)} robots, the recording has {self._count}")
         self._stop = threading.Event()
         self.scene = Scene(server, spec, self._count)
         self.scene.shown = self._count

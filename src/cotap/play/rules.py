@@ -18,12 +18,12 @@ LAW_FIELDS = {f"stiffness_{axis}": "stiffness" for axis in AXES} | {
 
 
 def consistent(asked: Mapping[str, Any]) -> dict[str, Any]:
-    """`asked`, and what changes with it: to stand ends velocities, a velocity ends standing. Asked for both, robots
-    stand."""
-    if asked.get("stand"):
-        return {**asked, **dict.fromkeys(VELOCITIES, 0.0)}
-    if any(asked.get(name) for name in VELOCITIES):
-        return {**asked, "stand": False}
+    """`asked`, and what changes with it: to stand, or to squat, ends velocities; to walk ends standing and squatting.
+    Asked for both, robots stand."""
+    if asked.get("stand") or asked.get("height_offset"):
+        return {**asked, **dict.fromkeys(VELOCITIES, 0.0), "stand": True}
+    if asked.get("stand") is False or any(asked.get(name) for name in VELOCITIES):
+        return {**asked, "stand": False, "height_offset": 0.0}
     return dict(asked)
 
 

@@ -15,19 +15,26 @@ Sample = dict[str, np.ndarray]
 """One step of N robots, (N, ...) each, by the names of `Trajectory` and of `recording.SCENE`."""
 
 
-def take_sample(env: HumanoidEnv, fell: torch.Tensor, laws: list[list[str]], force_h: torch.Tensor) -> Sample:
+def take_sample(
+    env: HumanoidEnv, fell: torch.Tensor, laws: list[list[str]], force_h: torch.Tensor, before: Sample
+) -> Sample:
     """The step that `env` has just made.
+
+    Of a robot that fell, or whose simulation diverged, it is the step before: the robot stands anew already.
 
     Args:
         env: N envs.
         fell: (N,) bool from the step's extras.
         laws: [N][H] names of the arms' laws.
         force_h: (N, H, 3) what pulled on the hands [N].
+        before: The step before; empty if there was none.
     """
     state = env.record.state
     reference_t = env.record.key_points_reference_t[:, : len(env.spec.arms)]
     jacobian_h = state.torso_to_heading.unsqueeze(1) @ env.reader.arm_chains.jacobian(state.arms)
     stiffness = env.arm_stiffness()
+    stiffness = torch.where(fell[:, None, None, None], torch.eye(stiffness.shape[-1]), stiffness)
+    jacobian_h = jacobian_h.masked_fill(fell[:, None, None, None], 0.0)  # it may not be finite
     none = [[law in WITHOUT_STIFFNESS for law in row] for row in laws]
     commanded = env.upper_body.parameters.stiffness.masked_fill(torch.tensor(none).unsqueeze(-1), math.nan)
     eigenvalues = torch.linalg.eigvalsh(stiffness)
@@ -43,7 +50,11 @@ def take_sample(env: HumanoidEnv, fell: torch.Tensor, laws: list[list[str]], for
     }
     absent = torch.full_like(stiffness[..., 0, 0], math.nan)
     scene |= {name: env.upper_body.report.get(name, absent).clone() for name in ("store_energy", "held_back")}
-    return {name: value.numpy() for name, value in (trajectory_row(env, fell) | scene).items()}
+    sample = {name: value.numpy() for name, value in (trajectory_row(env, fell) | scene).items()}
+    down = fell.numpy()
+    for name in before.keys() - {"fell"} if down.any() else ():
+        sample[name] = np.where(down.reshape(-1, *[1] * (sample[name].ndim - 1)), before[name], sample[name])
+    return sample
 
 
 def effective_stiffness(jacobian: torch.Tensor, joint_stiffness: torch.Tensor) -> torch.Tensor:

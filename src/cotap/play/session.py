@@ -53,6 +53,7 @@ class Session:
         policy = load_policy(self._checkpoints[first])
         self.env = HumanoidEnv(play_config(policy.env_config, library))
         self._loaded: dict[str, Policy] = {}
+        self._sha256: dict[str, str] = {}
         self._policies = [self._policy(first)] * len(ROBOTS)
         env = self.env
         self.sides = tuple(arm.side for arm in env.spec.arms)
@@ -68,6 +69,7 @@ class Session:
         self.hand_forces = HandForces(len(ROBOTS), self.sides, env.dt)
         env.forces.scripted.active = True
         self.num_steps = 0
+        self._sample: Sample = {}
         self.falls = [0] * len(ROBOTS)
         self._apply_all()
         self.reset()
@@ -121,7 +123,7 @@ class Session:
         self._observations, _, done, extras = env.step(self._act())
         self.num_steps += 1
         laws = [[self.values[f"{robot}.{side}.law"] for side in self.sides] for robot in ROBOTS]
-        sample = take_sample(env, extras["falls"], laws, force_h)
+        self._sample = sample = take_sample(env, extras["falls"], laws, force_h, self._sample)
         for i, fell in enumerate(extras["falls"].tolist()):
             self.falls[i] += fell
         if done.any():
@@ -135,7 +137,7 @@ class Session:
             "sides": list(self.sides),
             "gait_period_s": self.env.cfg.gait.period_s,
             "values": {name: value for name, value in self.values.items() if not name.endswith(".drag")},
-            "checkpoints_sha256": {r: sha256(self._checkpoints[self.values[f"{r}.checkpoint"]]) for r in ROBOTS},
+            "checkpoints_sha256": {r: self._sha256[self.values[f"{r}.checkpoint"]] for r in ROBOTS},
         }
 
     def _act(self) -> torch.Tensor:
@@ -154,7 +156,7 @@ class Session:
             path = self._checkpoints[name]
             policy = load_policy(path)
             require_acting(path, policy, self.env.layout())
-            self._loaded[name] = policy
+            self._loaded[name], self._sha256[name] = policy, sha256(path)
         return self._loaded[name]
 
     def _apply_all(self) -> None:
@@ -213,7 +215,8 @@ class Session:
         stand = v["stand"]
         velocity = torch.tensor([0.0, 0.0] if stand else [v["velocity_x"], v["velocity_y"]]).repeat(n, 1)
         yaw_rate = torch.full((n,), 0.0 if stand else v["yaw_rate"])
-        height = torch.full((n,), self.env.spec.nominal_height_m + v["height_offset"])
+        # Robots that walk learn to do so at their nominal height only.
+        height = torch.full((n,), self.env.spec.nominal_height_m + (v["height_offset"] if stand else 0.0))
         self.env.commands.override(velocity, yaw_rate, torch.full((n,), float(stand)), height)
 
     def _face_forward(self, mask: torch.Tensor) -> None:

@@ -44,7 +44,8 @@ class FromMjcfOptions:
 def facts_of(path: Path | str, velocity_limit_rad_s: float = 20.0, source: str = "not stated") -> dict[str, Any]:
     """Bodies of a humanoid with their masses, inertias, colliding shapes and joints, and pairs that never collide.
 
-    Bodies without a joint become part of their parents, and meshes that collide boxes. Visual shapes are left out.
+    Bodies without a joint become part of their parents, and meshes that collide boxes. Visual shapes and dry friction
+    of joints are left out.
 
     Raises:
         ValueError: the file or a mesh of it cannot be read, or the robot has what a `RobotSpec` cannot express.
@@ -147,6 +148,8 @@ def _joint(model: mujoco.MjModel, joint: int, mirror: tuple[str, float], velocit
         raise ValueError(f"joint {j.name!r} needs a range")
     if j.pos.any() or j.qpos0[0] != 0.0:
         raise ValueError(f"joint {j.name!r} must lie in its body's origin and count from zero: no pos, no ref")
+    if model.jnt_stiffness[joint] != 0.0:
+        raise ValueError(f"joint {j.name!r} must have no spring, got stiffness {model.jnt_stiffness[joint]:g}")
     return {
         "name": j.name,
         "axis": j.axis.tolist(),
@@ -161,18 +164,19 @@ def _joint(model: mujoco.MjModel, joint: int, mirror: tuple[str, float], velocit
 
 
 def _torque_limit(model: mujoco.MjModel, joint: int) -> float:
-    """Of the joint itself, or else of its actuator [Nm]."""
-    if model.jnt_actfrclimited[joint]:
-        return float(abs(model.jnt_actfrcrange[joint]).max())
+    """The least that the joint itself and its actuator allow [Nm]."""
+    limits = [abs(model.jnt_actfrcrange[joint]).max()] if model.jnt_actfrclimited[joint] else []
     for a in range(model.nu):
-        if model.actuator_trnid[a, 0] != joint:
+        if model.actuator_trntype[a] != mujoco.mjtTrn.mjTRN_JOINT or model.actuator_trnid[a, 0] != joint:
             continue
-        gear = abs(float(model.actuator_gear[a, 0]))
+        gear = abs(model.actuator_gear[a, 0])
         if model.actuator_forcelimited[a]:
-            return gear * float(abs(model.actuator_forcerange[a]).max())
+            limits.append(gear * abs(model.actuator_forcerange[a]).max())
         if model.actuator_ctrllimited[a] and model.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_NONE:
-            return gear * float(model.actuator_gainprm[a, 0] * abs(model.actuator_ctrlrange[a]).max())
-    raise ValueError(f"joint {model.joint(joint).name!r} needs a torque limit: give it an actuatorfrcrange")
+            limits.append(gear * model.actuator_gainprm[a, 0] * abs(model.actuator_ctrlrange[a]).max())
+    if not limits:
+        raise ValueError(f"joint {model.joint(joint).name!r} needs a torque limit: give it an actuatorfrcrange")
+    return float(min(limits))
 
 
 def _collides(model: mujoco.MjModel, geom: int) -> bool:

@@ -29,7 +29,9 @@ def resolve_backend(name: str) -> str:
     missing = {"mjbatch": _lack_of_mjbatch(), "warp": _lack_of_warp()}
     if name != "auto":
         if reason := missing.get(name):
-            raise ValueError(f"backend {name!r} needs {reason}: pip install cotap[{name}]")
+            raise ValueError(
+                f"backend {name!r} needs {reason}: in cotap's folder, pip install -e '.[{name}]'"
+            )
         return name
     if torch.cuda.is_available() and not missing["warp"]:
         return "warp"

@@ -17,12 +17,13 @@ from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.punches import PunchConfig, Punches
 from cotap.evaluation import report
 from cotap.evaluation.law_options import LawOptions
-from cotap.evaluation.protocol import Protocol
+from cotap.evaluation.protocol import Protocol, select_motion
 from cotap.evaluation.rollout import UPPER_ACTIONS, PolicyFunction, acting, picture_row
 from cotap.evaluation.tour.arm_walk import INTERVAL_S, ArmWalk, arms_at
 from cotap.evaluation.tour.route import Pilot, draw_waypoints
 from cotap.evaluation.tour.scores import TourScorer
 from cotap.evaluation.tour.stance import TourStance, tour_stance
+from cotap.motions.reference import HELD
 from cotap.robots import RobotSpec
 from cotap.rotations import yaw_of
 
@@ -118,6 +119,9 @@ class Tour(Protocol):
     def configure(self, env_cfg: HumanoidEnvConfig) -> HumanoidEnvConfig:
         """Turn the environment that a policy was trained in into this protocol's. Changes and returns `env_cfg`."""
         super().configure(env_cfg)
+        select_motion(env_cfg.motions.clips, (HELD,), "")  # arms go where the tour sends them
+        if (env_cfg.upper_body.left.name == "pd") != (env_cfg.upper_body.right.name == "pd"):
+            raise ValueError("the tour gives PD arms gains of its own, and so needs both arms under PD, or neither")
         if env_cfg.control_dt != CONTROL_S:
             raise ValueError(f"the tour is for policies with a control step of {CONTROL_S} s, got {env_cfg.control_dt}")
         env_cfg.substeps, env_cfg.collision = round(CONTROL_S / PHYSICS_S), "full"
