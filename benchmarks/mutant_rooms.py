@@ -43,6 +43,7 @@ ROOMS: dict[str, dict[str, tuple[str, ...]]] = {
     "deployment": {
         "src/cotap/deployment/controller.py": (LOOP, STOP),
         "src/cotap/deployment/engines.py": (ENGINES, STOP),
+        "src/cotap/deployment/golden.py": (EXPORT, "tests/deployment/test_example_runner.py"),
         "src/cotap/deployment/graph.py": (EXPORT,),
         "src/cotap/deployment/joint_law.py": (ENGINES, LOOP, STOP),
         "src/cotap/deployment/keyboard.py": (LOOP,),

@@ -2,8 +2,8 @@
 
 `python examples/run_policy.py policy.onnx` runs it for a second on sensors that always say the same: a robot at rest
 in its default pose. A robot puts its own sensors and motors in their place, and calls `step` every `control_dt`.
-`--check` takes the readings that the file has with it through the loop, and compares observation and targets with its
-own.
+`--check` takes the readings that the file has with it through the loop, and compares the last observation and its
+targets with the file's.
 """
 
 from __future__ import annotations
@@ -135,12 +135,14 @@ class PolicyRunner:
 
 
 def check(path: str) -> None:
-    """Compare the loop's first step with the one that the file has worked out; exit with 1 where they differ."""
+    """Compare the loop's last step with the one that the file has worked out; exit with 1 where they differ."""
     runner = PolicyRunner(path)
     golden = runner.meta["golden"]
-    names = ("joint_pos", "joint_vel", "angular_velocity", "gravity")
-    sensors = Sensors(*(np.array(golden["readings"][name]) for name in names))
-    targets = runner.step(sensors, Command(), runner.reference)
+    runner.phase, command = np.float32(golden["phase"]), Command(**golden["command"])
+    targets = np.zeros(0)
+    for r in golden["readings"]:
+        sensors = Sensors(*(np.array(r[name]) for name in ("joint_pos", "joint_vel", "angular_velocity", "gravity")))
+        targets = runner.step(sensors, command, np.array(r["arm_reference"]))
     for name, got in (("observation", runner.observation), ("joint_targets", targets)):
         worst = float(np.abs(got - np.array(golden[name])).max())
         print(f"{name}: differs from the file's by at most {worst:.1e}")

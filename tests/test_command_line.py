@@ -103,10 +103,7 @@ def test_a_missing_package_is_named_with_its_cure(monkeypatch: pytest.MonkeyPatc
     monkeypatch.delitem(sys.modules, "cotap.compare", raising=False)
     monkeypatch.setitem(sys.modules, "tyro", None)
     assert main(["compare", "a.json", "b.json"]) == 2
-    assert (
-        "cotap compare needs tyro: in cotap's folder, pip install -e '.[train]'"
-        in capsys.readouterr().err
-    )
+    assert "cotap compare needs tyro: in cotap's folder, pip install -e '.[train]'" in capsys.readouterr().err
 
 
 def test_help_in_short_has_first_sentences_whole_and_help_in_full_all_of_them():

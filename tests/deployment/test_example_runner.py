@@ -96,18 +96,41 @@ def test_it_needs_numpy_and_onnxruntime_alone(policy_file):
     assert len(done.stdout.splitlines()) == len(OnnxPolicy(policy_file).metadata.joints)
 
 
-def test_the_loop_is_checked_against_the_file(robot, random_policy, example, tmp_path, capsys):
-    path = random_policy(robot=robot, output_gain=0.3)
+@pytest.mark.parametrize("upper_mode", ["residual", "absolute"])
+def test_the_loop_is_checked_against_the_file(robot, upper_mode, random_policy, example, tmp_path, capsys):
+    path = random_policy(robot=robot, upper_mode=upper_mode, output_gain=0.3)
     example.check(str(path))
     assert capsys.readouterr().out.count("differs from the file's by at most") == 2
     proto = onnx.load(path)
     golden = next(p for p in proto.metadata_props if p.key == "golden")
     content = json.loads(golden.value)
-    content["readings"]["joint_pos"] = content["readings"]["joint_pos"][::-1]
+    content["readings"][-1]["joint_pos"] = content["readings"][-1]["joint_pos"][::-1]
     golden.value = json.dumps(content)
     onnx.save(proto, tmp_path / "p.onnx")
     with pytest.raises(SystemExit):
         example.check(str(tmp_path / "p.onnx"))
+
+
+FAULTS = {
+    "history newest first": ("terms for m in self.history", "terms for m in self.history[::-1]"),
+    "action without its scale": (") / self.action_scale", ")"),
+    "no limit of the command's rate": ("-self.velocity_rate, self.velocity_rate)", "-9.0, 9.0)"),
+    "gait half as fast": ('self.dt / self.meta["gait"]', '0.5 * self.dt / self.meta["gait"]'),
+    "torque without damping": (" - self.kd * s.joint_vel", ""),
+    "reference of the step before": ("self.reference = np.array(arm_reference)", "self.reference = self.reference"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_the_check_finds_faults_of_a_loop(fault, random_policy, tmp_path):
+    right, wrong = FAULTS[fault]
+    text = EXAMPLE.read_text(encoding="utf-8")
+    assert text.count(right) == 1
+    (tmp_path / "mine.py").write_text(text.replace(right, wrong), encoding="utf-8")
+    path = str(random_policy(output_gain=0.3))
+    for file, status in ((EXAMPLE, 0), (tmp_path / "mine.py", 1)):
+        done = subprocess.run([sys.executable, str(file), "--check", path], capture_output=True, text=True)
+        assert done.returncode == status, done.stderr
 
 
 def test_it_refuses_arms_under_another_law(policy_file, example, tmp_path):

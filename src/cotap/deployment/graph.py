@@ -17,9 +17,10 @@ from cotap import __version__
 from cotap.agents.actors import DualActorCritic
 from cotap.agents.checkpoint import require_layout, sha256
 from cotap.configs import to_plain
+from cotap.deployment.golden import golden_steps
 from cotap.deployment.metadata import FORMAT, INPUT, LAW_TARGETS, TARGETS, PolicyMetadata
 from cotap.deployment.policy import OnnxPolicy
-from cotap.deployment.terms import about_terms, golden_moment
+from cotap.deployment.terms import about_terms
 from cotap.envs import HumanoidEnvConfig
 from cotap.envs.actions import JointTargets
 from cotap.envs.modulation import Modulation
@@ -90,11 +91,14 @@ def export_policy(checkpoint: Path | str, output: Path, checks: int = 1000, seed
     reference = newest(terms, history, "reference_arm_position")
     modulation = Modulation(cfg.upper_body.modulation, [cfg.upper_body.of(side) for side in sides], cfg.control_dt)
     graph = TargetGraph(policy.model, targets, modulation, cfg.actions.clip, reference).eval()
-    readings, observation = golden_moment(cfg, spec, terms, history, seed)
     with torch.no_grad():
+        steps, observation = golden_steps(
+            cfg, spec, terms, history, lambda seen: graph(seen)[0],
+            lambda arms: targets(torch.zeros(1, len(spec.joints), dtype=arms.dtype), arms), targets.scale.double(),
+            seed,
+        )  # fmt: skip
         found = zip((TARGETS, LAW_TARGETS), graph(observation.unsqueeze(0)), strict=False)
-        golden = {"readings": readings, "observation": observation.tolist()}
-        golden |= {name: values[0].tolist() for name, values in found}
+        golden = steps | {"observation": observation.tolist()} | {name: values[0].tolist() for name, values in found}
     metadata = describe(cfg, spec, targets, policy.stage, sha256(checkpoint), golden)
     worst = 0.0
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from cotap.checks import is_finite, legible, quoted, reason_of, require_one_of, require_positive_int, require_range
 
-FORMAT = "cotap-policy-3"
+FORMAT = "cotap-policy-4"
 INPUT, TARGETS, LAW_TARGETS = "observation", "joint_targets", "law_targets"
 STAGES = ("base", "distill")
 UPPER_MODES = ("residual", "absolute")
@@ -59,8 +59,8 @@ class PolicyMetadata:
     law: dict[str, Any]
     """The arms' laws in training (`left`, `right`) and all that belongs to them."""
     golden: dict[str, Any]
-    """A first step worked out: `readings`, the `observation` (O,) that they make, and its `joint_targets` (J,) [rad]
-    (and `law_targets`), to check a robot's loop against."""
+    """Steps worked out: the `command` asked for, the gait's `phase` at the start, `readings` step by step, and the last
+    `observation` (O,) with its `joint_targets` (J,) [rad] (and `law_targets`), to check a robot's loop against."""
     checkpoint_sha256: str
     cotap_version: str
     opset: int

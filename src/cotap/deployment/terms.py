@@ -1,11 +1,9 @@
-"""What a robot must put into each term of the observation: quantity, unit, range; and a moment worked out."""
+"""What a robot must put into each term of the observation: quantity, unit, range."""
 
 from __future__ import annotations
 
 import math
 from typing import Any
-
-import torch
 
 from cotap.envs import HumanoidEnvConfig
 from cotap.envs.modulation import OBSERVED_STIFFNESS
@@ -46,32 +44,3 @@ def about_terms(cfg: HumanoidEnvConfig, spec: RobotSpec, terms: tuple[Term, ...]
         "law_log_stiffness": (f"logarithm of stiffness along x, y, z over {OBSERVED_STIFFNESS:g} N/m", "1", stiffness),
     }  # fmt: skip
     return {name: dict(zip(("what", "unit", "range"), about[name], strict=True)) for name, _, _ in terms}
-
-
-def golden_moment(
-    cfg: HumanoidEnvConfig, spec: RobotSpec, terms: tuple[Term, ...], history: int, seed: int
-) -> tuple[dict[str, list[float]], torch.Tensor]:
-    """Readings of the first step of a robot that is asked to stand, and the observation (W,) that they make.
-
-    Readings are `joint_pos` and `joint_vel` (J,), `angular_velocity` (3,) and `gravity` (3,) of the torso. The arms'
-    reference is the default pose.
-    """
-    rng = torch.Generator().manual_seed(seed)
-    default = torch.tensor([j.default_rad for j in spec.joints], dtype=torch.float64)
-    moved, rates, turn, tilt = (
-        [round(v, 4) for v in (scale * (2.0 * torch.rand(n, generator=rng) - 1.0)).tolist()]
-        for n, scale in ((len(default), 0.1), (len(default), 0.5), (3, 0.3), (2, 0.1))
-    )
-    gravity = [*tilt, -math.sqrt(1.0 - tilt[0] ** 2 - tilt[1] ** 2)]
-    laws = [cfg.upper_body.of(arm.side) for arm in spec.arms]
-    position = (default + torch.tensor(moved, dtype=torch.float64)).tolist()
-    values = {
-        "torso_angular_velocity": turn, "projected_gravity": gravity, "command_stand": [1.0],
-        "command_height": [spec.nominal_height_m], "reference_arm_position": default[len(spec.lower_joints) :].tolist(),
-        "joint_position": moved, "joint_velocity": rates,
-        "law_alpha": [law.alpha for law in laws],
-        "law_log_stiffness": [math.log(k / OBSERVED_STIFFNESS) for law in laws for k in law.stiffness],
-    }  # fmt: skip
-    rows = [scale * torch.tensor(values.get(name, [0.0] * width)).repeat(history) for name, width, scale in terms]
-    readings = {"joint_pos": position, "joint_vel": rates, "angular_velocity": turn, "gravity": gravity}
-    return readings, torch.cat(rows)

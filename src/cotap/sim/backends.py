@@ -29,9 +29,7 @@ def resolve_backend(name: str) -> str:
     missing = {"mjbatch": _lack_of_mjbatch(), "warp": _lack_of_warp()}
     if name != "auto":
         if reason := missing.get(name):
-            raise ValueError(
-                f"backend {name!r} needs {reason}: in cotap's folder, pip install -e '.[{name}]'"
-            )
+            raise ValueError(f"backend {name!r} needs {reason}: in cotap's folder, pip install -e '.[{name}]'")
         return name
     if torch.cuda.is_available() and not missing["warp"]:
         return "warp"

@@ -1,0 +1,119 @@
+"""A few steps of the loop worked out, for users to check a loop of their own against."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+from cotap.envs import HumanoidEnvConfig
+from cotap.envs.commands import CommandSource
+from cotap.envs.modulation import OBSERVED_STIFFNESS
+from cotap.envs.observations import ObservationHistory, Term
+from cotap.robots import RobotSpec
+
+STEPS = 8
+"""More than a history has, so that none of it is of the first step."""
+PHASE = 0.2
+"""Of the gait at the start."""
+VELOCITY, YAW_RATE = (0.4, -0.2), 0.3
+"""What is asked for [m/s], [rad/s]; commands are still on their way there at the end."""
+
+Targets = Callable[[torch.Tensor], torch.Tensor]
+
+
+def golden_steps(
+    cfg: HumanoidEnvConfig, spec: RobotSpec, terms: tuple[Term, ...], history: int, targets: Targets, offset: Targets,
+    scale: torch.Tensor, seed: int,
+) -> tuple[dict[str, Any], torch.Tensor]:  # fmt: skip
+    """Made-up readings of a robot that is asked to walk, and the last observation (W,) that they lead to.
+
+    Each of the readings has `joint_pos` and `joint_vel` (J,), `angular_velocity` and `gravity` (3,) of the torso, and
+    `arm_reference` (U,), where the arms are to be at the step's end. What follows from a law and not from the loop is
+    among them under its term's name: torques of arms that are not under PD, and what modulated laws are set to.
+
+    Args:
+        cfg: The policy's environment.
+        spec: Its robot.
+        terms: Of its observation.
+        history: Steps in it.
+        targets: Observations (1, W) to joint targets (1, J) [rad].
+        offset: Reference (1, U) to what scaled actions (1, J) are added to [rad].
+        scale: (J,) radians per unit of action.
+        seed: Of what is made up.
+    """
+    rng = torch.Generator().manual_seed(seed)
+    joints, arms = spec.joints, slice(len(spec.lower_joints), None)
+    default, kp, kd, limit = (
+        torch.tensor([[getattr(j, name) for j in joints]], dtype=torch.float64)
+        for name in ("default_rad", "kp", "kd", "torque_limit_nm")
+    )
+    limit = cfg.torque_limit_scale * limit
+    commands = CommandSource(cfg.commands, cfg.gait, 1, spec.nominal_height_m, cfg.control_dt)
+    commands.override(
+        torch.tensor([VELOCITY]), torch.tensor([YAW_RATE]), torch.zeros(1), torch.tensor([spec.nominal_height_m])
+    )
+    commands.reset(torch.ones(1, dtype=torch.bool), rng)
+    commands.gait.phase[:] = PHASE
+    buffer = ObservationHistory(terms, 1, history)
+    reference, action, sent, readings = default[:, arms], torch.zeros_like(default), default, []
+    observation = torch.zeros(0)
+    for k in range(STEPS):
+        made_up = _reading(cfg, spec, rng)
+        if k == STEPS - 1:  # so that what is sent is what the network said
+            made_up["arm_reference"] = readings[-1]["arm_reference"]
+        q, dq = (torch.tensor([made_up[name]], dtype=torch.float64) for name in ("joint_pos", "joint_vel"))
+        torque = (kp * (sent - q) - kd * dq).clamp(-limit, limit)[:, arms] * (k > 0)
+        if k > 0:
+            commands.step(rng)
+        values = _values(made_up, commands, default) | {
+            "reference_arm_position": reference, "last_action": action, "arm_torque": torque,
+        }  # fmt: skip
+        values |= {name: torch.tensor([made_up[name]]) for name in made_up.keys() & {name for name, _, _ in terms}}
+        present = buffer.scaled({name: value.double() for name, value in values.items()}).float()
+        observation = buffer.append(present, torch.tensor([k == 0]))
+        action = (targets(observation).double() - offset(reference)) / scale
+        reference = torch.tensor([made_up["arm_reference"]], dtype=torch.float64)
+        sent = offset(reference) + scale * action
+        readings.append(made_up)
+    asked = {"velocity": list(VELOCITY), "yaw_rate": YAW_RATE, "stand": False, "height": spec.nominal_height_m}
+    return {"command": asked, "phase": PHASE, "readings": readings}, observation[0]
+
+
+def _reading(cfg: HumanoidEnvConfig, spec: RobotSpec, rng: torch.Generator) -> dict[str, list[float]]:
+    """One step's readings, each a little off what it is at rest."""
+
+    def near(values: list[float], width: float) -> list[float]:
+        return [round(v + width * (2.0 * float(torch.rand(1, generator=rng)) - 1.0), 4) for v in values]
+
+    default = [j.default_rad for j in spec.joints]
+    tilt = near([0.0, 0.0], 0.1)
+    reading = {
+        "joint_pos": near(default, 0.1), "joint_vel": near([0.0] * len(default), 0.5),
+        "angular_velocity": near([0.0] * 3, 0.3), "gravity": [*tilt, -math.sqrt(1.0 - tilt[0] ** 2 - tilt[1] ** 2)],
+        "arm_reference": near(default[len(spec.lower_joints) :], 0.05),
+    }  # fmt: skip
+    laws = [cfg.upper_body.of(arm.side) for arm in spec.arms]
+    if any(law.name != "pd" for law in laws):
+        reading["arm_torque"] = near([0.0] * len(spec.upper_joints), 5.0)
+    if cfg.upper_body.modulation.terms(len(laws)):
+        reading["law_alpha"] = [law.alpha for law in laws]
+        reading["law_log_stiffness"] = [math.log(k / OBSERVED_STIFFNESS) for law in laws for k in law.stiffness]
+    return reading
+
+
+def _values(made_up: dict[str, list[float]], commands: CommandSource, default: torch.Tensor) -> dict[str, torch.Tensor]:
+    """The terms that follow from readings and commands, unscaled."""
+    command = commands.current()
+    angle, walking = 2.0 * math.pi * command.phase, 1.0 - command.stand
+    return {
+        "torso_angular_velocity": torch.tensor([made_up["angular_velocity"]], dtype=torch.float64),
+        "projected_gravity": torch.tensor([made_up["gravity"]], dtype=torch.float64),
+        "joint_position": torch.tensor([made_up["joint_pos"]], dtype=torch.float64) - default,
+        "joint_velocity": torch.tensor([made_up["joint_vel"]], dtype=torch.float64),
+        "command_velocity": command.velocity_h, "command_yaw_rate": command.yaw_rate[:, None],
+        "command_stand": command.stand[:, None], "command_height": command.height[:, None],
+        "sin_phase": (walking * angle.sin())[:, None], "cos_phase": (walking * angle.cos())[:, None],
+    }  # fmt: skip
