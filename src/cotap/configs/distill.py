@@ -41,7 +41,6 @@ def default(base: BaseTraining) -> DistillTraining:
     pushes = env.forces.pushes
     pushes.hand_share = 0.5  # hands are what the law is for
     pushes.velocity, pushes.largest_pitch = (0.0, 1.5), 0.5 * math.pi
-    pushes.beside_base = 0.5  # at a hand, full impulses topple a third of what they hit
     env.path.share = 0.1
     env.rewards.upper.reference_closeness = 0.1  # at 1.0 the agent learned to do nothing
     training.ppo.value_clip = 0.0  # its values must follow forces that have grown
