@@ -121,7 +121,7 @@ def test_three_trainings_give_students_interval():
     assert three.outside(-3.0)
     assert not three.outside(6.9)
     one = Trainings((1.0,))
-    assert one.text(1) == "1.0 (range 1.0 to 1.0; one training: no interval)"
+    assert one.text(1) == "1.0 (one training)"
     assert not one.outside(9.0)
     assert Trainings(()).text() == "(not measured)"
 

@@ -31,7 +31,8 @@ class Trainings:
         """Mean, range and interval."""
         if not self.values:
             return "(not measured)"
+        if self.interval is None:
+            return f"{self.values[0]:.{digits}f} (one training)"
         spread = f"{min(self.values):.{digits}f} to {max(self.values):.{digits}f}"
-        low, high = self.interval or (0.0, 0.0)
-        bounds = f"interval {low:.{digits}f} to {high:.{digits}f}" if self.interval else "one training: no interval"
-        return f"{mean(self.values):.{digits}f} (range {spread}; {bounds})"
+        low, high = (f"{bound:.{digits}f}" for bound in self.interval)
+        return f"{mean(self.values):.{digits}f} (range {spread}; interval {low} to {high})"
