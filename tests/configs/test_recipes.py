@@ -288,7 +288,7 @@ def test_facet_is_trained_on_unmoved_references_and_otherwise_as_cotap():
     changed = {"track_key_points": 0.0, "track_key_velocities": 0.0, "track_hands_as_facet": 1.3}
     assert to_plain(facet.env.rewards.upper) == to_plain(weights) | changed
     assert weights.track_arms == 2.0
-    assert weights.reference_closeness == 0.1
+    assert weights.reference_closeness == 1.0
 
 
 @pytest.mark.parametrize(

@@ -42,8 +42,8 @@ def default(base: BaseTraining) -> DistillTraining:
     pushes.hand_share = 0.5  # hands are what the law is for
     pushes.velocity, pushes.largest_pitch = (0.0, 1.5), 0.5 * math.pi
     env.path.share = 0.1
-    env.rewards.upper.reference_closeness = 0.1  # at 1.0 the agent learned to do nothing
-    training.ppo.value_clip = 0.0  # its values must follow forces that have grown
+    # At 0.1 the agent brought arms 2 % closer, and resisted small loads: hands felt stiffer by up to a quarter.
+    env.rewards.upper.reference_closeness = 1.0
     if env.actions.upper_mode == "residual":
         training.distillation.anew = ("upper",)  # under PD it has learned to resist loads
     training.train_for(150e6)
@@ -65,8 +65,6 @@ def paper(base: BaseTraining) -> DistillTraining:
     sampling = LawSampling(enabled=True, stiffness=(150.0, 450.0), log_uniform=False)
     training.env.upper_body = UpperBodyConfig(left=pd_damped, right=copy.deepcopy(pd_damped), sampling=sampling)
     training.env.forces.pushes.enabled = False
-    training.env.rewards.upper.reference_closeness = 1.0
-    training.ppo.value_clip = base.ppo.value_clip
     training.distillation.anew = ()
     training.train_for(20_000 * training.ppo.steps * 4096)
     return training
