@@ -210,7 +210,7 @@ def test_an_engine_that_is_not_installed_is_named(spec, monkeypatch):
         return real(name, *args, **kwargs)
 
     monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(ModuleNotFoundError, match=r"pip install 'cotap\[pybullet\]'"):
+    with pytest.raises(ModuleNotFoundError, match=r"pip install -e '\.\[pybullet\]'"):
         make_engine(EngineConfig(engine="pybullet"), spec)
 
 

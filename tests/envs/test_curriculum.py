@@ -12,7 +12,7 @@ import torch
 from env_tools import NOMINAL, drive, felt, hold_still, knock_over, mujoco_of, zeros
 
 from cotap.compliance.kinematics import ChainPose
-from cotap.envs.commands import Command
+from cotap.envs.commands import Command, CommandConfig
 from cotap.envs.curriculum import AssistConfig, AssistWrench, Curriculum, CurriculumConfig, RampConfig
 from cotap.envs.external_forces import ExternalForceConfig
 from cotap.envs.pushes import PushConfig
@@ -289,7 +289,8 @@ def test_it_acts_on_the_torso_and_nowhere_else(make_env, robot):
 def test_it_pulls_the_robot_as_a_rope_at_its_torso(make_env, robot):
     """Generalised forces against MuJoCo's own, of a pull at the torso's centre of mass and a couple."""
     assist = AssistConfig(enabled=True, velocity_gain=5.0, yaw_gain=0.2)
-    env = make_env(2, robot=robot, assist=assist, randomization=NOMINAL)
+    fast = CommandConfig(velocity_x=(-9.0, 9.0), velocity_y=(-9.0, 9.0), yaw_rate=(-2.0, 2.0))
+    env = make_env(2, robot=robot, assist=assist, randomization=NOMINAL, commands=fast)
     hold_still(env, stand=0.0)
     two = torch.tensor([2.0, -2.0])
     env.commands.set_velocity(torch.tensor([[9.0, 0.0], [0.0, 9.0]]), two, torch.ones(2, dtype=torch.bool))

@@ -54,7 +54,7 @@ def make_stops(sides: tuple[str, ...]) -> tuple[Stop, ...]:
         ),
         Stop(
             "Each direction by itself",
-            f"The same push. The {one} hand is soft ahead and stiff across; the {other} one is the opposite. "
+            f"The same push, but the {one} hand is soft ahead and stiff across, and the {other} one is the opposite. "
             "The blue wires are long where much stiffness is asked for, and the hands give way where they are short.",
             ahead,
             _stiffness("a", one, 200.0, 1000.0, 1000.0) | _stiffness("a", other, 1000.0, 200.0, 200.0),
