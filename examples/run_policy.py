@@ -143,10 +143,11 @@ def check(path: str) -> None:
     for r in golden["readings"]:
         sensors = Sensors(*(np.array(r[name]) for name in ("joint_pos", "joint_vel", "angular_velocity", "gravity")))
         targets = runner.step(sensors, command, np.array(r["arm_reference"]))
-    for name, got in (("observation", runner.observation), ("joint_targets", targets)):
+    # A gain of hundreds turns what rounding does to targets into torque that is observed.
+    for name, got, allowed in (("observation", runner.observation, 1e-4), ("joint_targets", targets, 1e-5)):
         worst = float(np.abs(got - np.array(golden[name])).max())
         print(f"{name}: differs from the file's by at most {worst:.1e}")
-        if not worst <= 1e-5:
+        if not worst <= allowed:
             sys.exit(1)
 
 
