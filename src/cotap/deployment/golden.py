@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -11,7 +12,7 @@ import torch
 from cotap.envs import HumanoidEnvConfig
 from cotap.envs.commands import CommandSource
 from cotap.envs.modulation import OBSERVED_STIFFNESS
-from cotap.envs.observations import ObservationHistory, Term
+from cotap.envs.observations import ObservationHistory, Term, actor_values
 from cotap.robots import RobotSpec
 
 STEPS = 8
@@ -68,9 +69,10 @@ def golden_steps(
         torque = (kp * (sent - q) - kd * dq).clamp(-limit, limit)[:, arms] * (k > 0)
         if k > 0:
             commands.step(rng)
-        values = _values(made_up, commands, default) | {
-            "reference_arm_position": reference, "last_action": action, "arm_torque": torque,
-        }  # fmt: skip
+        turn, down = (torch.tensor([made_up[name]], dtype=torch.float64) for name in ("angular_velocity", "gravity"))
+        # Of the state, actors observe this alone.
+        state: Any = SimpleNamespace(torso_angular_velocity_t=turn, projected_gravity_t=down, joint_pos=q, joint_vel=dq)
+        values = actor_values(state, commands.current(), reference, default, action, torque)
         values |= {name: torch.tensor([made_up[name]]) for name in made_up.keys() & {name for name, _, _ in terms}}
         present = buffer.scaled({name: value.double() for name, value in values.items()}).float()
         observation = buffer.append(present, torch.tensor([k == 0]))
@@ -102,18 +104,3 @@ def _reading(cfg: HumanoidEnvConfig, spec: RobotSpec, rng: torch.Generator) -> d
         reading["law_alpha"] = [law.alpha for law in laws]
         reading["law_log_stiffness"] = [math.log(k / OBSERVED_STIFFNESS) for law in laws for k in law.stiffness]
     return reading
-
-
-def _values(made_up: dict[str, list[float]], commands: CommandSource, default: torch.Tensor) -> dict[str, torch.Tensor]:
-    """The terms that follow from readings and commands, unscaled."""
-    command = commands.current()
-    angle, walking = 2.0 * math.pi * command.phase, 1.0 - command.stand
-    return {
-        "torso_angular_velocity": torch.tensor([made_up["angular_velocity"]], dtype=torch.float64),
-        "projected_gravity": torch.tensor([made_up["gravity"]], dtype=torch.float64),
-        "joint_position": torch.tensor([made_up["joint_pos"]], dtype=torch.float64) - default,
-        "joint_velocity": torch.tensor([made_up["joint_vel"]], dtype=torch.float64),
-        "command_velocity": command.velocity_h, "command_yaw_rate": command.yaw_rate[:, None],
-        "command_stand": command.stand[:, None], "command_height": command.height[:, None],
-        "sin_phase": (walking * angle.sin())[:, None], "cos_phase": (walking * angle.cos())[:, None],
-    }  # fmt: skip
