@@ -18,6 +18,7 @@ OUTSIDE = {
     "CITATION.cff": "CITATION.cff",
     "NOTICE": "NOTICE.txt",
     "README.md": "overview.md",
+    "src/cotap/checkpoints/README.md": "card.md",
 }
 """Files of the repository that the site has too, and how it calls them; all of examples/ as well."""
 MEASURED = ("results.md", "results_g1.md", "redundancy.md")
