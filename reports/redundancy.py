@@ -68,8 +68,8 @@ alone. Written by `python -m reports.redundancy`: do not edit.
 A change is that of a measure from PD to CoTaP with the same policy, relative to PD, in the tests of [H1's
 page](results.md) and [G1's](results_g1.md): negative is better. Its 95 % interval, of which the larger half stands
 after ±, is a bootstrap over the envs that stood under both. *More*: G1's change is lower than H1's, and the interval of
-the difference of the changes, from theirs (square-and-add), does not hold zero; *less*: it is higher. Where CoTaP is
-worse than PD on both robots, *more* means less of a disadvantage. Forces are the same on both, though G1 has {g1:.0f}
+the difference of the changes, from theirs (square-and-add), does not hold zero; *less*: it is higher; no word: they
+cannot be distinguished. Cells have H1's change and G1's in percent. Where CoTaP is worse than PD on both robots, *more* means less of a disadvantage. Forces are the same on both, though G1 has {g1:.0f}
 kg and H1 {h1:.0f} kg; by mass, G1's push is smaller in proportion. Under the periodic load, both arms are those of one
 robot, the left under CoTaP, the right under PD. With 95 % intervals, about one comparison in twenty says more or less
 by chance. One training stands behind each policy, and the robots differ in more than their arms: gains, torque limits,
@@ -120,27 +120,32 @@ def page(h1: dict[str, Any], g1: dict[str, Any]) -> str:
     lines: list[str] = []
     verdicts = {name: Counter[str]() for name in NAMES.values()}
     for title, table in TABLES.items():
-        lines += [
-            "",
-            f"## {title.capitalize()}",
-            "",
-            row("measure", "arms", "H1 [%]", "G1 [%]", "on G1"),
-            "|---" * 5 + "|",
-        ]
-        for measure in table.measures:
-            for arms in table.arms:
+        columns = [NAMES[measure] for measure in table.measures]
+        lines += ["", f"## {title.capitalize()}", "", row("arms", *columns), "|---" * (1 + len(columns)) + "|"]
+        for arms in table.arms:
+            cells = []
+            for measure in table.measures:
                 pair = [
                     content["changes"].get(mode, {}).get(arms, {}).get(measure)
                     for content, mode in zip((h1, g1), table.modes, strict=True)
                 ]
                 found = verdict(*pair) if all(pair) else "not measured"
                 verdicts[NAMES[measure]][found] += 1
-                lines.append(row(NAMES[measure], arms, *map(hundredfold, pair), found))
+                cells.append(compared(pair, found))
+            lines.append(row(arms, *cells))
     total = sum(verdicts.values(), Counter[str]())
     weights = {name: robots.ROBOTS[name]().mass_kg for name in ROBOTS}
     counts = [row(name, *(str(found[v]) for v in VERDICTS)) for name, found in verdicts.items()]
     head = [HEAD.format(answer=answer(total), **weights), "", row("measure", *VERDICTS), "|---" * 5 + "|", *counts]
     return "\n".join([*head, "", WHY, *causes(h1, g1), *lines, ""])
+
+
+def compared(pair: list[dict[str, Any] | None], found: str) -> str:
+    """H1's change, G1's, and the verdict where there is one of two."""
+    if found == "not measured":
+        return found
+    mark = {"more": ", **more**", "less": ", *less*"}.get(found, "")
+    return f"{hundredfold(pair[0])} / {hundredfold(pair[1])}{mark}"
 
 
 def causes(h1: dict[str, Any], g1: dict[str, Any]) -> list[str]:

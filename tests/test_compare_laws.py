@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -84,8 +85,8 @@ def test_static_table(tmp_path, capsys, policy):
     assert content["rows"]["cotap, task error"]["displacement"] == pytest.approx(content["ideal"], rel=0.05)
     text = (tmp_path / "static.md").read_text()
     assert text in capsys.readouterr().out
-    assert "Within 10 % of ideal at all loads: cotap, task error." in text
-    assert "0.043 / 0.068 / 0.106 |" in text  # the paper's
+    assert re.search(r"\| cotap, task error \| 2\.0±\d\.\d \([+-]\d%\) \|", text)  # 10 N at 500 N/m
+    assert "4.3 / 6.8 / 10.6 |" in text  # the paper's
 
 
 @pytest.mark.slow
@@ -96,7 +97,8 @@ def test_transient_table(tmp_path, policy):
     rows = content["forces"]["200"]
     assert rows["facet"]["metrics_without_falls"]["overshoots"]["mean"] >= 1.0
     text = (tmp_path / "transient.md").read_text()
-    assert "cotap, task error, oscillation beside facet's: **less**" in text
+    (line,) = (line for line in text.splitlines() if line.startswith("| cotap, task error |"))
+    assert "| **less** |" in line
 
 
 @pytest.mark.slow

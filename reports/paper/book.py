@@ -116,7 +116,7 @@ class Book:
     def figure(self, name: str, caption: str) -> Path:
         """Where a figure goes; its place on the page is here."""
         self.assets.mkdir(parents=True, exist_ok=True)
-        self.add("", f"![{caption}](results/{self.robot}/{name}.png)", "", f"*{caption}*")
+        self.add("", f"![{name.replace('_', ' ')}](results/{self.robot}/{name}.png)", "", f"*{caption}*")
         return self.assets / f"{name}.png"
 
     def write(self) -> None:

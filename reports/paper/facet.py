@@ -15,8 +15,8 @@ on it along x."""
 OWN = "The row *facet* has the policy `facet`, all others `cotap`."
 SHARED = "There is no policy `facet`: all rows have `cotap`."
 WHY = """{paper} has a hand that rises under 10 and 30 N with CoTaP alone, and goes down under 50 N; ours goes down by
-{cotap} m. FACET moves the reference by F / K, and PD yields on top of it: {facet} m. Under CoTaP + FACET
-compliances add, so that twice F / K would be right: {both} m."""
+{cotap} cm. FACET moves the reference by F / K, and PD yields on top of it: {facet} cm. Under CoTaP + FACET
+compliances add, so that twice F / K would be right: {both} cm."""
 
 
 def facet(book: Book) -> None:
@@ -66,5 +66,7 @@ def measured(book: Book, name: str, table: Any, caption: str) -> dict[str, Any]:
 
 
 def moved(result: dict[str, Any], name: str) -> str:
-    """How far down a row's hand goes under each load [m]."""
-    return " / ".join("-" if value is None else f"{value:.3f}" for value in result["rows"][name]["displacement"])
+    """How far down a row's hand goes under each load [cm]."""
+    return " / ".join(
+        "-" if value is None else f"{100.0 * value:.1f}" for value in result["rows"][name]["displacement"]
+    )
