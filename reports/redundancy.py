@@ -69,11 +69,11 @@ A change is that of a measure from PD to CoTaP with the same policy, relative to
 page](results.md) and [G1's](results_g1.md): negative is better. Its 95 % interval, of which the larger half stands
 after ±, is a bootstrap over the envs that stood under both. *More*: G1's change is lower than H1's, and the interval of
 the difference of the changes, from theirs (square-and-add), does not hold zero; *less*: it is higher; no word: they
-cannot be distinguished. Cells have H1's change and G1's in percent. Where CoTaP is worse than PD on both robots, *more* means less of a disadvantage. Forces are the same on both, though G1 has {g1:.0f}
-kg and H1 {h1:.0f} kg; by mass, G1's push is smaller in proportion. Under the periodic load, both arms are those of one
-robot, the left under CoTaP, the right under PD. With 95 % intervals, about one comparison in twenty says more or less
-by chance. One training stands behind each policy, and the robots differ in more than their arms: gains, torque limits,
-legs.
+cannot be distinguished. Cells have H1's change and G1's in percent. Where CoTaP is worse than PD on both robots, *more*
+means less of a disadvantage. Forces are the same on both, though G1 has {g1:.0f} kg and H1 {h1:.0f} kg; by mass, G1's
+push is smaller in proportion. Under the periodic load, both arms are those of one robot, the left under CoTaP, the
+right under PD. With 95 % intervals, about one comparison in twenty says more or less by chance. One training stands
+behind each policy, and the robots differ in more than their arms: gains, torque limits, legs.
 
 ## On which measures"""
 WHY = """## Why
