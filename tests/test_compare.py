@@ -89,6 +89,40 @@ def test_shares_keep_their_width_and_one_env_has_none():
     assert (row["difference"], row["reason"]) == (None, "fewer than two envs have both")
 
 
+def test_shares_without_falls_are_of_the_envs_that_stood_in_both():
+    """The two agree wherever both stood; the hard envs, in which A fell, say nothing."""
+    easy, hard = [1.0] * 30, [0.0] * 20
+    a = with_envs(easy + hard, stood=[1.0] * 30 + [0.0] * 20)
+    b = with_envs(easy + hard)
+    for r, kept in ((a, easy), (b, easy + hard)):
+        r["metrics_without_falls"] = {"x": summarize(torch.tensor(kept).bool())}
+    row = compare(a, b, without_falls=True)["differences"]["x"]
+    assert (row["a"], row["b"], row["b_is"]) == (1.0, 1.0, "not distinguishable")
+
+
+def test_slopes_are_compared_too():
+    a, b = (result() | {"slopes": {"slope_x": s}, "slopes_ci95": {"slope_x": [s - 0.1, s + 0.1]}} for s in (0.5, 0.9))
+    assert compare(a, b)["differences"]["slope_x"]["difference"] == pytest.approx(0.4)
+    with pytest.raises(ValueError, match="no measure in common"):
+        compare(a, b, without_falls=True)
+
+
+@pytest.mark.parametrize(
+    ("slopes", "intervals", "named"),
+    [
+        ([], {}, "slopes and slopes_ci95 must be objects"),
+        ({"slope_x": 1.0}, {}, "of the same names"),
+        ({"slope_x": "1"}, {"slope_x": None}, "slopes.slope_x.mean must be a finite number"),
+        ({"slope_x": 1.0}, {"slope_x": [1.0]}, "slopes.slope_x.ci95 must be two finite numbers"),
+    ],
+)
+def test_slopes_that_are_none_are_refused(tmp_path, capsys, slopes, intervals, named):
+    file = tmp_path / "a.json"
+    file.write_text(json.dumps(result() | {"slopes": slopes, "slopes_ci95": intervals}))
+    assert main([str(file), str(file)]) == 2
+    assert named in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("envs", "named"),
     [

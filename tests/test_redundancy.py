@@ -50,6 +50,8 @@ def test_the_page_compares_every_mode(tmp_path):
     out = tmp_path / "docs.md"
     assert redundancy.main(["--h1", h1, "--g1", g1, "--output", str(out)]) == 0
     page = out.read_text()
+    assert page.count("Robots that stood under both laws: H1 100 to 100, G1 100 to 100.") == 5
+    assert page.count("Robots that stood under both laws: H1 100 to 100, G1 not measured.") == 1
     assert page.count("| K 100 | -10.0±1.0 / -20.0±1.0, **more** |") == 3
     # Impacts: 5 measures of 5 arms in 4 tables; constant load: 3 of 4 arms; periodic load: 3 of one.
     assert "**Of 90 comparisons 90 say more, 0 less, and 0 cannot be distinguished; 25 were not measured.**" in page

@@ -42,7 +42,7 @@ ANY_FORCE_N = (500.0, 1000.0)
 ANY_DIRECTION = """The push of 50 ms at the left hand has a random horizontal direction; the arms move."""
 
 COMPARED = """By the 95 % intervals of the differences, env by env, from PD with the same policy and with the base.
-Where the answer is no, the measures that are not named are better."""
+Less is better. Where the answer is no, the measures that are not named are better."""
 
 LIMITS = """Under the robot's own torque limits, an arm joint is at its limit for {own} of the time at K 100, here for
 {free}. e_ee: K 500 < K 100: with the limits {with_limits}; without them {without_limits}."""

@@ -72,9 +72,21 @@ def read(path: str) -> dict[str, Any]:
             raise ValueError(f"{path!r}: {part} has {len(content[part])} measures; at most {_MOST} are read")
         for name, summary in content.get(part, {}).items():
             _require_summary(f"{path!r}: {part}.{name}", summary)
+    _require_slopes(path, content)
     if "per_env" in content:
         _require_envs(f"{path!r}: per_env", content["per_env"])
     return content
+
+
+def _require_slopes(path: str, content: dict[str, Any]) -> None:
+    """Raise ValueError unless slopes, if there are any, have an interval or null each."""
+    slopes, intervals = content.get("slopes", {}), content.get("slopes_ci95", {})
+    if not isinstance(slopes, dict) or not isinstance(intervals, dict) or slopes.keys() != intervals.keys():
+        raise ValueError(f"{path!r}: slopes and slopes_ci95 must be objects of the same names")
+    if len(slopes) > _MOST:
+        raise ValueError(f"{path!r}: slopes has {len(slopes)} measures; at most {_MOST} are read")
+    for name, value in slopes.items():
+        _require_summary(f"{path!r}: slopes.{name}", {"mean": value, "ci95": intervals[name]})
 
 
 def _require_summary(where: str, summary: Any) -> None:
@@ -116,7 +128,7 @@ def compare(a: dict[str, Any], b: dict[str, Any], without_falls: bool = False) -
     if a["protocol"] != b["protocol"]:
         raise ValueError(f"protocols differ: {quoted(a['protocol'])} and {quoted(b['protocol'])}")
     key = "metrics_without_falls" if without_falls else "metrics"
-    names = [name for name in a.get(key, {}) if name in b.get(key, {})]
+    names = [name for name in measures(a, key) if name in measures(b, key)]
     if not names:
         raise ValueError(f"the evaluations have no measure in common in {key}")
     rows = {name: judged(name, measure_difference(a, b, name, without_falls)) for name in names}
@@ -151,8 +163,30 @@ def measure_difference(a: dict[str, Any], b: dict[str, Any], name: str, without_
     # A bootstrap of shares has no width where all envs agree; Newcombe's interval has.
     if paired and not {*old, *new} <= {0.0, 1.0, None}:
         return paired_difference(a["per_env"], b["per_env"], name, without_falls)
+    if paired and without_falls:
+        return difference(*_shares_of_both(a["per_env"], b["per_env"], name))
     key = "metrics_without_falls" if without_falls else "metrics"
-    return difference(a[key][name], b[key][name])
+    return difference(measures(a, key)[name], measures(b, key)[name])
+
+
+def _shares_of_both(a: dict[str, Any], b: dict[str, Any], name: str) -> list[dict[str, Any]]:
+    """How often something happened in each of two evaluations, over the envs that stood in both and have it in both."""
+    import torch
+
+    from cotap.evaluation.metrics import summarize
+
+    stood = [x and y for x, y in zip(a["stood"], b["stood"], strict=True)]
+    both = [s and None not in pair for s, *pair in zip(stood, a[name], b[name], strict=True)]
+    return [summarize(torch.tensor([bool(v) for v, keep in zip(x[name], both, strict=True) if keep])) for x in (a, b)]
+
+
+def measures(evaluation: dict[str, Any], key: str) -> dict[str, Any]:
+    """Summaries by measure: those of `key`, and the slopes, which are over all envs."""
+    slopes = {
+        name: {"mean": value, "ci95": evaluation["slopes_ci95"][name], "reason": "the command did not differ"}
+        for name, value in evaluation.get("slopes", {}).items()
+    }
+    return evaluation.get(key, {}) | (slopes if key == "metrics" else {})
 
 
 def paired_difference(a: dict[str, Any], b: dict[str, Any], name: str, without_falls: bool) -> dict[str, Any]:

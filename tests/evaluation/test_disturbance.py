@@ -12,6 +12,8 @@ from test_metrics import trajectory
 from cotap.compare import compare
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.actions import ActionConfig
+from cotap.envs.arm_task import task_forces
+from cotap.envs.commands import CommandConfig
 from cotap.evaluate import main
 from cotap.evaluation.disturbance import (
     ConstantLoad,
@@ -28,6 +30,7 @@ from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.protocol import mirrored_pose
 from cotap.evaluation.rollout import acting, idle, record_rollout
 from cotap.evaluation.velocity_tracking import VelocityTracking
+from cotap.motions.reference import ClipConfig, ReferenceConfig
 
 LEFT, RIGHT, BOTH = [0], [1], [0, 1]
 
@@ -271,6 +274,38 @@ def test_a_push_moves_the_hand_that_it_hits():
     assert m["metrics"]["e_ee_hit"]["mean"] > m["metrics"]["e_ee"]["mean"]
     assert m["effective_stiffness"]["measured"] is None
     assert "over before" in m["effective_stiffness"]["reason"]
+
+
+def test_what_a_robot_that_falls_draws_is_nothing_to_the_others(make_env):
+    """Two rollouts of one seed, one robot of the second begins again: all else that is drawn is the same, its own too.
+    The next rollout draws anew."""
+
+    def rollout(falls: bool, times: int = 1) -> list[torch.Tensor]:
+        motions = ReferenceConfig(clips=ClipConfig(hold_s=(0.1, 0.4)))
+        env = make_env(12, commands=CommandConfig(resample_s=(0.1, 0.5)), motions=motions, forces=task_forces())
+
+        def fall(env: HumanoidEnv, step: int) -> None:
+            if falls and step in (4, 11):
+                env._restart(torch.arange(12) == 0)
+
+        for _ in range(times):
+            record_rollout(env, idle(env), 60, progress=False, before_step=fall)
+        assert env.redraws
+        load = env.forces.hand_loads.state_dict()["_force_h"]
+        return [env.commands.asked_velocity, env.motions.current().position, env.actuation.delay_s, load]
+
+    straight, fell, again = rollout(False), rollout(True), rollout(False, 2)
+    for a, b, c in zip(straight, fell, again, strict=True):
+        assert torch.equal(a, b)
+        assert not torch.equal(a, c)
+
+
+def test_a_load_on_hands_of_two_stiffnesses_has_none_that_was_asked_for():
+    load = ConstantLoad(num_envs=2, force=(0.0, 0.0, -10.0), randomize=False, pelvis="fixed", hand="both")
+    for right, asked in (("100", [100.0] * 3), ("800", None)):
+        _, result = run(load, left="cotap:stiffness=100", right=f"cotap:stiffness={right}")
+        assert result["effective_stiffness"]["commanded"] == asked
+        assert ("impedance_error" in result["metrics"]) == (asked is not None)
 
 
 def test_a_push_on_the_base_is_on_no_hand(robot):

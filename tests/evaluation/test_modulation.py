@@ -57,6 +57,26 @@ def test_waiting_by_hand():
     assert reached.tolist() == [True, True, True, True, False, False, False, False]
 
 
+def test_a_fall_ends_a_delay_unreached():
+    """Half of what is asked for from step 5 on; in step 10 the env falls and begins again, where nothing is wanting."""
+    record = StoreRecord()
+    for t in range(20):
+        ratio = torch.tensor([[0.5 if 5 <= t < 10 else 1.0]])
+        asked = 100.0 if t < 5 else 200.0
+        record.level.append(torch.ones(1, 1))
+        record.held_back.append(torch.zeros(1, 1))
+        record.ratio.append(ratio)
+        record.stiffness.append(ratio * asked)
+    changed = torch.zeros(20, 1, 1, dtype=torch.bool)
+    changed[5] = True
+    counted = torch.arange(20)[:, None] < 10
+    found, more = measures(record, changed, counted, 0.02)
+    assert float(found["reached_fraction"]) == 0.0
+    assert float(found["stiffening_delay_s"]) == pytest.approx(5 * 0.02)
+    rows = curve(record, changed | ~counted[..., None], more, 0.02, 1.0, 0)
+    assert rows["ratio"] == [0.5] * 5
+
+
 def test_a_stores_measures_by_hand():
     """One env of two arms, one without a store. More is asked for in step 1, less in step 4."""
     nan = float("nan")

@@ -14,13 +14,12 @@ from cotap.compliance.laws import LawConfig
 from cotap.configs import BASE_RECIPES, DISTILL_RECIPES
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.arm_task import TASK_WEIGHTS
-from cotap.envs.commands import CommandConfig
 from cotap.envs.modulation import ModulationConfig
 from cotap.envs.upper_body import UpperBodyConfig
 from cotap.evaluate import evaluate, main, parse, prepare
 from cotap.evaluation.law_options import LawOptions
 from cotap.evaluation.rollout import reference_actions
-from cotap.evaluation.task import Task, step_figures, task_measures
+from cotap.evaluation.task import step_figures, task_measures
 from reports.modulation_grid import Options, Trial, asked, hand_states
 from reports.modulation_grid import main as grid
 
@@ -118,25 +117,6 @@ def test_its_alpha_is_what_was_asked_for(checkpoint_of, capsys):
     assert "| return |" in capsys.readouterr().out
     assert main(["task", "--episode-seconds", "0"]) == 2
     assert "episode_seconds" in capsys.readouterr().err
-
-
-def test_what_a_robot_that_falls_draws_is_nothing_to_the_others(make_env):
-    """Two rollouts of one seed; in one of them a robot begins again. Only who draws in the same step gets another."""
-    asked_for = []
-    for falls in (False, True):
-        task = Task(num_envs=12, seed=3)
-        env = make_env(12, commands=CommandConfig(resample_s=(0.2, 1.0)))
-        task.prepare(env)
-        env.reset()
-        for step in range(40):
-            task.before_step(env, step)
-            env.step(torch.zeros(12, env.num_actions))
-            if falls and step == 4:
-                env._restart(torch.arange(12) == 0)
-        asked_for.append(env.commands.asked_velocity)
-    alike = (asked_for[0] == asked_for[1]).all(1)
-    assert not alike[0]
-    assert int(alike.sum()) > 8
 
 
 BY_STATE = ((1.0, 900.0, 900.0, 900.0), (0.5, 600.0, 600.0, 1200.0), (0.9, 80.0, 80.0, 80.0))

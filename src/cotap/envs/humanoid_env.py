@@ -48,8 +48,9 @@ class HumanoidEnv(VecEnv):
     record of the step; ended envs restart; observations. After a step, everything in an observation is current; foot
     sensors (rewards and critics only) lag one physics step.
 
-    `action_slices` and `reward_groups` tell agents, by name, which actions and which reward are theirs; `step` returns
-    the sum of the groups' rewards, and each group's in `extras["group_rewards"]` (N, groups).
+    `action_slices` and `reward_groups` name the agents alike, in one order: which actions and which column of rewards
+    are theirs. `step` returns the sum of the groups' rewards, and each group's in `extras["group_rewards"]` (N,
+    groups).
 
     Args:
         cfg: What defines it.
@@ -112,6 +113,9 @@ class HumanoidEnv(VecEnv):
         self.samples = self.num_diverged = 0
         self.keeps_final_observation = False
         """Whether `final_observation` (N, O) and `diverged` (N,) are kept of envs that end, as Gymnasium asks for."""
+        self.redraws = True
+        """Whether an env that ends draws body, commands, motion and forces anew, as it does in training. Where it does
+        not, it goes on with those that it had, so that no other env's random numbers depend on who falls."""
         self.diverged = torch.zeros(n, dtype=torch.bool)
         self.episode_length_buf = torch.zeros(n, dtype=torch.long)
         self.torque = torch.zeros(n, self._num_joints)
@@ -252,10 +256,13 @@ class HumanoidEnv(VecEnv):
 
     def _restart(self, mask: torch.Tensor, start: tuple[torch.Tensor, torch.Tensor] | None = None) -> None:
         """Begin new episodes in the n envs of `mask` (N,), from `qpos` (n, 7 + J) and `qvel` (n, 6 + J) if given."""
-        self.randomizer.randomize_episode(mask, self.actuation.delay_s, self.rng)
-        for part in (self.commands, self.motions, self.upper_body, self.forces):
-            part.reset(mask, self.rng)
-        qpos, qvel = start or start_state(self.cfg, self.spec, self.motions.current().position[mask], self.rng)
+        rng = self.rng if self.redraws else self.rng.clone_state()
+        if self.redraws:
+            self.randomizer.randomize_episode(mask, self.actuation.delay_s, rng)
+            for part in (self.commands, self.motions, self.forces):
+                part.reset(mask, rng)
+        self.upper_body.reset(mask, rng)
+        qpos, qvel = start or start_state(self.cfg, self.spec, self.motions.current().position[mask], rng)
         self.sim.reset(mask, qpos, qvel)
         self.actuation.reset(mask, qpos[:, 7:])
         for held in (self.observer, self.recorder):
@@ -267,7 +274,10 @@ class HumanoidEnv(VecEnv):
         else:
             ids = mask.nonzero().squeeze(1)
             self.state = self.state.with_envs(ids, self.reader.read(ids))
-        self.path.reset(mask, self.state.torso_pos_w[:, :2], self.state.heading_w, self.rng)
+        self.path.reset(mask, self.state.torso_pos_w[:, :2], self.state.heading_w, rng)
+        if self.cfg.path.share > 0.0:  # those that are led are told to walk from their first observation on
+            still = torch.zeros_like(self.state.torso_pos_w)
+            self.commands.set_velocity(still[:, :2], still[:, 2], self.path.active & mask)
 
     def _observe(self, restarted: torch.Tensor) -> TensorDict:
         """Observe the present; envs in `restarted` (N,) have no history before it."""

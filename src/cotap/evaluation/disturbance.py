@@ -137,13 +137,15 @@ class Impact(Scenario):
         return "the force's direction differs between envs" if self.random_direction else ""
 
     def _commanded(self, env: HumanoidEnv) -> list[float] | None:
-        """Stiffness [N/m] of the first hand that the force is on; None under a law that commands none, and where the
-        policy sets it."""
+        """Stiffness [N/m] of the hands that the force is on; None under a law that commands none, where the policy sets
+        it, and where both hands have one of their own."""
         modulation = env.cfg.upper_body.modulation
         if modulation.kind != "none" and not modulation.held:
             return None
-        law = env.cfg.upper_body.of(env.spec.arms[self.hit(env)[0]].side)
-        return list(law.stiffness) if law.name not in WITHOUT_STIFFNESS else None
+        laws = [env.cfg.upper_body.of(env.spec.arms[hand].side) for hand in self.hit(env)]
+        if any(law.name in WITHOUT_STIFFNESS or law.stiffness != laws[0].stiffness for law in laws):
+            return None
+        return list(laws[0].stiffness)
 
     def _stiffness(self, env: HumanoidEnv, measures: dict[str, torch.Tensor], stood: torch.Tensor) -> dict[str, Any]:
         """Force over displacement, where the load is held and is the same in all envs."""

@@ -109,17 +109,19 @@ def tracking_measures(t: Trajectory, gait_period_s: float, settle_s: float = 1.0
     Errors are against what was asked, once that has held for `settle_s`. Heights count for robots that are asked to
     stand, which alone are asked for other heights than the nominal, once theirs has held for `HEIGHT_SETTLE_S`. `_gait`
     errors use velocities averaged over a gait period, all of it settled, and so do `stand_drift`, the speed while asked
-    to stand, and `still_share`, the share of that time that is slower than `STILL_SPEED` with all feet down.
-    `stride_rate` is how often each foot swings while asked to walk; the gait asks for one swing a period.
+    to stand, and `still_share`, the share of that time that is slower than `STILL_SPEED` with all feet down. Along a
+    path, whose commands change all the time, feet are measured at every step. `stride_rate` is how often each foot
+    swings while asked to walk; the gait asks for one swing a period.
     """
     period = round(gait_period_s / t.dt)
     ok = settled(t, settle_s)
     ok_gait = settled(t, settle_s + gait_period_s)
     error = t.velocity - t.command
-    walking = ok & ~t.stand
+    moving = ok | (t.alive() & torch.isfinite(t.path_error))  # where a path leads, commands never stay the same
+    walking = moving & ~t.stand
     swing_height, num_swings = swings(t.foot_height, t.foot_contact, walking, round(0.1 / t.dt))
     walking_s = walking.sum(0) * t.dt
-    contact = t.foot_contact & ok.unsqueeze(2)
+    contact = t.foot_contact & moving.unsqueeze(2)
     slip = torch.where(contact, t.foot_speed, torch.zeros_like(t.foot_speed)).sum((0, 2)) / contact.sum(
         (0, 2)
     ).clamp_min(1)

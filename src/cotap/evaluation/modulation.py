@@ -124,7 +124,9 @@ class Modulation(ConstantLoad):
         found, more = store_measures(self.stores, changed, counted, dt)
         for part, figures in outcome(found, ~trajectory.fell.any(0), self.seed, self.per_env).items():
             result[part] |= figures
-        result["reaching"] = curve(self.stores, changed, more, dt, self.period / 2.0, self.seed)
+        result["reaching"] = curve(
+            self.stores, changed | ~counted.unsqueeze(-1), more, dt, self.period / 2.0, self.seed
+        )
 
     def plot(self, path: Path, result: dict[str, Any]) -> None:
         """With an energy store, the stiffness asked for and in force since a step to more; else as a load's."""

@@ -266,7 +266,7 @@ def table(content: dict[str, Any]) -> str:
     lines = [f"| law, energy drawn [J] | {' | '.join(COMMANDS)} |", "|---|" + "---|" * len(COMMANDS)]
     for law, row in content["rows"].items():
         lines.append(f"| {law} | {' | '.join(_cell(row[command]) for command in COMMANDS)} |")
-    fell = f"{content['num_falls']} of {content['num_envs']} envs fell or diverged"
+    fell = f"{content['num_falls']} of {content['num_envs']} exciters saw a fall or a divergence in some generation"
     about = f"{heading(content)}, pelvis {content['settings']['pelvis']}, {content['settings']['mode']}"
     return "\n".join([*lines, "", "Mean (95 % interval) over poses; largest of all.", "", f"{about}: {fell}"])
 

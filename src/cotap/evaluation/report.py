@@ -105,7 +105,7 @@ def table(result: dict[str, Any]) -> str:
             continue
         lines.append(f"| {name} | {m['mean']:.4f} | {m['std']:.4f} | {interval(m)} | {unit(name)} |")
     for name, value in result.get("slopes", {}).items():
-        slope = {"ci95": result["slopes_ci95"][name], "reason": "no env walked or stood"}
+        slope = {"ci95": result["slopes_ci95"][name], "reason": "no env walked or stood under commands that differ"}
         lines.append(f"| {name} | {'-' if value is None else f'{value:.4f}'} | | {interval(slope)} | |")
     falls = f"{result['num_falls']} of {result['num_envs']} envs fell"
     return "\n".join([*lines, "", f"{heading(result)}: {falls}, {result['seconds']:.1f} s"])

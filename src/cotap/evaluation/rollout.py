@@ -83,6 +83,8 @@ def record_rollout(
 ) -> Trajectory:  # fmt: skip
     """Run `policy` for `steps` control steps from a fresh start of every env.
 
+    What an env draws does not depend on who falls: two rollouts of one seed compare env by env.
+
     Args:
         env: The envs.
         policy: Actions of observations, on the envs' device; what is recorded is on the CPU.
@@ -93,7 +95,9 @@ def record_rollout(
     Raises:
         ValueError: there is no memory for the record, and for measures of it, which take as much again.
     """
+    env.redraws = True  # should a rollout have been broken off
     obs = env.reset()
+    env.redraws = False
     record: dict[str, torch.Tensor] = {}
     frames: list[torch.Tensor] = []
     for step in tqdm(range(steps), desc="rollout", unit="step", disable=None if progress else True, leave=False):
@@ -107,6 +111,7 @@ def record_rollout(
         for name, value in row.items():
             record.setdefault(name, value.new_empty((steps, *value.shape)))[step] = value
         frames.append(picture_row(env))
+    env.redraws = True
     return Trajectory(
         dt=env.dt, film=torch.stack(frames).cpu(), **{name: value.cpu() for name, value in record.items()}
     )

@@ -11,7 +11,7 @@ import torch
 
 from cotap.checks import require_positive_int, require_range
 from cotap.compliance.interface import LawParameters
-from cotap.compliance.laws import LAWS, LawConfig
+from cotap.compliance.laws import LAWS, WITHOUT_STIFFNESS, LawConfig
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.scripted_forces import ForceProfile
 from cotap.evaluation.linearization import linearize
@@ -77,8 +77,17 @@ class Stability(Protocol):
         env_cfg.forces.scripted = ForceProfile((1.0, 1.0, 1.0), "both", start_s=0.0)
         return env_cfg
 
+    def prepare(self, env: HumanoidEnv) -> None:
+        """Raise ValueError unless both arms are under one law."""
+        super().prepare(env)
+        if env.cfg.upper_body.left != env.cfg.upper_body.right:
+            raise ValueError("stability analyses one law: name it by --method, not by --left and --right")
+        if env.cfg.upper_body.left.name in WITHOUT_STIFFNESS:
+            for name in ("change_factor", "change_seconds"):
+                self.require_default(name, "under a law without a stiffness")
+
     def evaluate(self, env: HumanoidEnv, policy: PolicyFunction) -> dict[str, Any]:  # noqa: ARG002
-        """Analyse and measure the left arm's law. Returns the measured part of the JSON."""
+        """Analyse and measure the arms' law. Returns the measured part of the JSON."""
         arms = env.cfg.upper_body
         rates = growth_rates(env.spec, arms.built(arms.left), self, env.dt)
         exchanged, self.film = exchanged_energy(env, self)
@@ -208,10 +217,13 @@ def table(content: dict[str, Any]) -> str:
         lines.append(
             f"| {row['wall']:g} | {row['load_rad']:g} | {row['largest_real_part']:+.2f} | {row['share_unstable']:.1%} |"
         )
-    lines += ["", "| stiffness | least energy, mean [J] | least of all [J] | trials drawn from |", "|---|---|---|---|"]
+    lines += ["", "| stiffness | least energy, mean [J] | least of all [J] | trials drawn from | diverged |"]
+    lines.append("|---|---|---|---|---|")
     for name, row in content["energy"].items():
         numbers = [f"{row[k]:.4f}" if row[k] is not None else "-" for k in ("mean_least_energy", "least_energy")]
-        lines.append(f"| {name.split('_')[0]} | {numbers[0]} | {numbers[1]} | {row['share_drawn']:.1%} |")
+        lines.append(
+            f"| {name.split('_')[0]} | {numbers[0]} | {numbers[1]} | {row['share_drawn']:.1%} | {row['num_diverged']} |"
+        )
     return "\n".join([*lines, "", f"{heading(content)}: {content['num_poses']} poses"])
 
 

@@ -66,7 +66,7 @@ def measures(
     Args:
         record: Of T steps.
         changed: (T, N, A) bool: what is asked for jumped in that step.
-        counted: (T, N) bool: the step counts.
+        counted: (T, N) bool: the step counts; one that does not ends a delay as a change does.
         dt: [s].
     """
     level, held, ratio, stiffness = (
@@ -76,7 +76,7 @@ def measures(
     more = torch.zeros_like(changed)
     more[1:] = changed[1:] & (asked[1:] > (1.0 + NEAR) * asked[:-1])
     more = more & counted.unsqueeze(-1)
-    steps, reached = waiting(ratio, changed)
+    steps, reached = waiting(ratio, changed | ~counted.unsqueeze(-1))
 
     def over_arms(values: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
         mask = mask & values.isfinite()
@@ -92,16 +92,16 @@ def measures(
 
 
 def curve(
-    record: StoreRecord, changed: torch.Tensor, more: torch.Tensor, dt: float, seconds: float, seed: int
+    record: StoreRecord, ended: torch.Tensor, more: torch.Tensor, dt: float, seconds: float, seed: int
 ) -> dict[str, Any]:
-    """Over time since a change in `more` (T, N, A), until the next one: means of what is asked for, in force and left
-    in the store; the ratio of the two with an interval over envs."""
+    """Over time since a change in `more` (T, N, A), until one is `ended` (T, N, A) by the next or by a fall: means of
+    what is asked for, in force and left in the store; the ratio of the two with an interval over envs."""
     rows: dict[str, list[Any]] = {name: [] for name in ("time", "asked", "in_force", "store_energy", "ratio", "ci95")}
     ratio, stiffness, level = (torch.stack(x).float() for x in (record.ratio, record.stiffness, record.level))
     running = more
     for k in range(round(seconds / dt)):
         if k:  # one step further, where nothing new is asked for
-            running = torch.cat((torch.zeros_like(running[:1]), running[:-1])) & ~changed
+            running = torch.cat((torch.zeros_like(running[:1]), running[:-1])) & ~ended
         if not running.any():
             break
         rows["time"].append(k * dt)

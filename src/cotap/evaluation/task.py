@@ -54,11 +54,9 @@ class Task(RolloutProtocol):
         self._steps: list[torch.Tensor] = []
 
     def before_step(self, env: HumanoidEnv, step: int) -> None:
-        """Keep what the last step was worth, and draw this one's random numbers whatever was drawn before: so what a
-        robot that falls draws changes only what others draw in the same step."""
+        """Keep what the last step was worth."""
         if step:
             self._steps.append(step_figures(env))
-        env.rng.manual_seed((1_000_003 * self.seed + step) % 2**63)
 
     def measure(self, trajectory: Trajectory, env: HumanoidEnv) -> dict[str, Any]:
         """The measured part of the evaluation's JSON, falls aside."""

@@ -55,7 +55,7 @@ class VelocityTracking(RolloutProtocol):
         require_range("height_drop", self.height_drop, 0.0, 0.5)
         require_range("stand_probability", self.stand_probability, 0.0, 1.0)
         if self.follow_path:
-            for name in ("speed_x", "speed_y", "yaw_rate", "height_drop", "stand_probability"):
+            for name in ("command_seconds", "speed_x", "speed_y", "yaw_rate", "height_drop", "stand_probability"):
                 self.require_default(name, "while a path is followed")
         if self.collision:
             require_one_of("collision", self.collision, COLLISIONS)
@@ -84,6 +84,10 @@ class VelocityTracking(RolloutProtocol):
         measures = tracking_measures(trajectory, period, self.settle_seconds)
         found = outcome(measures, ~trajectory.fell.any(0), self.seed, self.per_env)
         slopes = tracking_slopes(trajectory, period, self.settle_seconds, self.seed)
+        if self.follow_path:
+            for summary in (*found["metrics"].values(), *found["metrics_without_falls"].values()):
+                if summary["n"] == 0:
+                    summary["reason"] = "commands change all the time while a path is followed"
         return {
             **{name: found["metrics"][name]["mean"] for name in ("e_lin", "e_yaw", "episode_length_fraction")},
             "slopes": {name: slope["mean"] for name, slope in slopes.items()},
