@@ -24,7 +24,7 @@ from cotap.configs import BASE_RECIPES, DISTILL_RECIPES, BaseTraining, from_plai
 from cotap.envs import HumanoidEnv, HumanoidEnvConfig
 from cotap.envs.rewards import LowerRewards, UpperRewards
 from cotap.evaluation import policy
-from cotap.pipeline import PipelineOptions
+from cotap.pipeline import PipelineOptions, train_both
 from cotap.sim import resolve_backend
 
 # Every option that these tests use, as typed on the command line.
@@ -636,13 +636,56 @@ def test_stopped_in_a_stage_the_pipeline_ends_there_and_goes_on_from_there(
     said = capsys.readouterr().err
     assert f"stopped at iteration 1 of 2 of {out / 'base'}" in said
     assert f"--run-dir {out} --resume" in said
-    assert [p.name for p in out.iterdir()] == ["base"]
+    assert sorted(p.name for p in out.iterdir()) == ["base", "pipeline.json"]
     assert run(*BOTH, RUN_DIR, out, RESUME) == 0
     assert "| distill | 1 | 48 |" in capsys.readouterr().out
     assert newest(out / "base")["iteration"] == 2
     kept = (out / "distill" / "checkpoint_000001.pt").read_bytes()
     assert run(*BOTH, RUN_DIR, out, RESUME) == 0  # there is nothing left to do
     assert (out / "distill" / "checkpoint_000001.pt").read_bytes() == kept
+
+
+def test_a_pipeline_goes_on_with_the_options_that_it_began_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Neither quick, seed nor the iterations are typed again; what would make another policy is refused."""
+    asked: list[list[str]] = []
+
+    def stage(name: str, args: list[str]) -> Path:
+        asked.append([name, *args])
+        folder = Path(args[args.index("--run-dir") + 1])
+        folder.mkdir(parents=True, exist_ok=True)
+        steps = args[args.index("--iterations") + 1]
+        save_checkpoint(
+            folder / f"checkpoint_{int(steps):06d}.pt", {"iteration": int(steps), "samples": 0, "wall_seconds": 0.0}
+        )
+        return folder
+
+    monkeypatch.setattr(pipeline, "expected", lambda _options: "")
+    out = tmp_path / "both"
+    train_both(PipelineOptions(run_dir=str(out), quick=True, seed=5, threads=1), stage)
+    began = list(asked)
+    asked.clear()
+    train_both(PipelineOptions(run_dir=str(out), resume=True), stage)
+    for before, after in zip(began, asked, strict=True):
+        for option in ("--seed", "--iterations", "--threads"):
+            assert before[before.index(option) + 1] == after[after.index(option) + 1]
+        assert "--resume" in after
+    with pytest.raises(ValueError, match=r"--robot 'g1': the runs in .* began with 'h1'"):
+        train_both(PipelineOptions(run_dir=str(out), resume=True, robot="g1"), stage)
+    with pytest.raises(ValueError, match=r"already holds 'base/checkpoint_001220\.pt': go on with --resume"):
+        train_both(PipelineOptions(run_dir=str(out)), stage)
+    (out / "pipeline.json").write_text("{")
+    with pytest.raises(ValueError, match="has no usable options"):
+        train_both(PipelineOptions(run_dir=str(out), resume=True), stage)
+    (out / "pipeline.json").unlink()
+    with pytest.raises(ValueError, match="its stages go on one by one"):
+        train_both(PipelineOptions(run_dir=str(out), resume=True), stage)
+
+
+def test_a_distillation_that_is_there_is_found_before_anything_is_trained(tmp_path: Path):
+    (tmp_path / "distill").mkdir()
+    save_checkpoint(tmp_path / "distill" / "checkpoint_000001.pt", {"iteration": 1})
+    with pytest.raises(ValueError, match=r"already holds 'distill/checkpoint_000001\.pt'"):
+        train_both(PipelineOptions(run_dir=str(tmp_path)), lambda *_: pytest.fail("a stage was trained"))
 
 
 def test_going_on_with_the_pipeline_needs_to_know_where(capsys: pytest.CaptureFixture[str]):
@@ -701,6 +744,14 @@ def test_a_base_that_would_be_ignored_is_refused(checkpoint: Path, tmp_path: Pat
     again = ["distill", RESUME, "auto", RUN_DIR, tmp_path / "run", BASE_CHECKPOINT, checkpoint, ITERATIONS, 3]
     assert run(*again) == 0
     assert newest(tmp_path / "run")["iteration"] == 3
+    checkpoint.unlink()  # the run has all that it needs of it
+    assert run(*again[:-1], 4) == 0
+    assert newest(tmp_path / "run")["iteration"] == 4
+
+
+def test_a_name_that_is_not_shipped_lists_those_that_are(capsys: pytest.CaptureFixture[str]):
+    assert run("distill", BASE_CHECKPOINT, "nosuch") == 2
+    assert "checkpoint 'nosuch' does not exist; shipped are: " in capsys.readouterr().err.replace("\n", " ")
 
 
 def test_without_a_stage_both_run_and_are_summed_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any):

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
-from cotap.agents.checkpoint import STAGES
-from cotap.checks import require_one_of, require_range
-from cotap.configs import BASE_RECIPES, DISTILL_RECIPES, BaseTraining, DistillTraining
+from cotap.agents.checkpoint import STAGES, write_json
+from cotap.checks import reason_of, require_one_of, require_range
+from cotap.configs import BASE_RECIPES, DISTILL_RECIPES, BaseTraining, DistillTraining, from_plain, to_plain
 
 RunStage = Callable[[str, list[str]], Path]
 """Trains one stage, given its name and its arguments as if typed, and returns its directory."""
+BEGUN_WITH = "pipeline.json"
+"""The file beside both runs that has the options which they began with."""
+MAY_CHANGE = ("run_dir", "resume", "base_iterations", "distill_iterations", "threads", "backend", "device")
+"""Options that may differ where a pipeline goes on."""
 
 
 @dataclass
@@ -29,7 +34,8 @@ class PipelineOptions:
     recipe: str = ""
     """Recipe of both stages: default, quick, paper or facet. Without it, default, or quick with --quick."""
     resume: bool = False
-    """Go on with the runs in --run-dir. A stage that is finished is not run again."""
+    """Go on with the runs in --run-dir, with the options that they began with. A stage that is finished is not run
+    again."""
     num_envs: int = 0
     """Number of envs; 0 for the recipe's. Samples stay the same."""
     base_iterations: int = 0
@@ -106,14 +112,56 @@ def train_both(options: PipelineOptions, run_stage: RunStage) -> Path:
     if Ranks.from_environment().size > 1:
         raise ValueError("several processes train stage by stage: cotap train base, then distill")
     run_dir = Path(options.run_dir or time.strftime("runs/cotap-%Y%m%d-%H%M%S"))
-    base_steps, distill_steps = options.iterations()
-    if not options.resume:
+    if options.resume:
+        options = _gone_on_with(options, run_dir)
+    else:
+        _require_unused(run_dir, "go on with --resume, or choose another --run-dir")
         print(expected(options), flush=True)
+    run_dir.mkdir(parents=True, exist_ok=True)
+    write_json(run_dir / BEGUN_WITH, to_plain(options))
+    base_steps, distill_steps = options.iterations()
     recipe = ["--recipe", options.chosen]
     base = _part(options, run_dir / "base", base_steps, [*recipe, "--robot", options.robot], run_stage)
     _part(options, run_dir / "distill", distill_steps, [*recipe, "--base-checkpoint", str(base)], run_stage)
     print(_summary(run_dir), end="")
     return run_dir
+
+
+def _require_unused(run_dir: Path, advice: str) -> None:
+    from cotap.agents.runner import newest_checkpoint
+
+    if found := next(filter(None, (newest_checkpoint(run_dir / stage) for stage in STAGES)), None):
+        raise ValueError(f"run directory {str(run_dir)!r} already holds {str(found.relative_to(run_dir))!r}: {advice}")
+
+
+def _gone_on_with(options: PipelineOptions, run_dir: Path) -> PipelineOptions:
+    """The options that the pipeline in a folder began with, but for those of `MAY_CHANGE` that are given now; these
+    options where nothing began there yet.
+
+    Raises:
+        ValueError: the folder has runs but not their options, those cannot be used, or another option differs.
+    """
+    path = run_dir / BEGUN_WITH
+    if not path.is_file():
+        advice = f"it has no {BEGUN_WITH}, so that its stages go on one by one: cotap train base --resume auto"
+        _require_unused(run_dir, advice)
+        return options
+    try:
+        begun = from_plain(PipelineOptions, json.loads(path.read_text(encoding="utf-8")))
+    except ValueError as error:
+        raise ValueError(f"{str(path)!r} has no usable options: {reason_of(error)}") from error
+    default = PipelineOptions()
+    for name in (field.name for field in fields(options)):
+        given, before = getattr(options, name), getattr(begun, name)
+        if given == getattr(default, name):
+            continue  # not given
+        if given != before and name not in MAY_CHANGE:
+            raise ValueError(
+                f"--{name.replace('_', '-')} {given!r}: the runs in {str(run_dir)!r} began with {before!r}"
+            )
+        setattr(begun, name, given)
+    begun.check()
+    return begun
 
 
 def expected(options: PipelineOptions) -> str:

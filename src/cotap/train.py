@@ -127,11 +127,11 @@ def _expand(args: list[str]) -> list[str]:
     """Arguments with names as the options have them, shortcuts written out, and the files that checkpoints' names and
     auto mean."""
     from cotap.agents.runner import newest_checkpoint
-    from cotap.evaluation.policy import CHECKPOINTS, find_checkpoint
+    from cotap.evaluation.policy import find_checkpoint
 
     args = [_named(key) + sep + value for key, sep, value in (a.partition("=") for a in args)]
     for option in ("--resume", "--base-checkpoint"):
-        if (given := _peek(args, option)) in CHECKPOINTS:
+        if (given := _peek(args, option)) not in ("", "auto"):
             args = [*args, f"{option}={find_checkpoint(given)}"]  # the last one counts
     if _peek(args, "--resume") != "auto":
         return args
@@ -193,6 +193,8 @@ def _parse_distill(args: list[str]) -> DistillOptions:
     samples = training.samples
     default = DistillOptions(recipe=recipe, base_checkpoint=base, training=training)
     options = tyro.cli(DistillOptions, args=args, default=default, prog="cotap train distill")
+    if resumed:
+        options.base_checkpoint = ""  # the resumed checkpoint brings its base, whose file may be gone
     _train_as_long(args, options, samples)
     return options
 

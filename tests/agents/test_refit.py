@@ -200,6 +200,13 @@ def test_what_cannot_be_refitted_is_refused(
         take_over("c.pt", given, new, now, other)
 
 
+def test_critics_that_read_something_else_are_refused_by_name(make_env: MakeEnv):
+    before, now = make_env(), make_env(observations=ObservationConfig(critic="history"))
+    given = content(before, old := trained(before, True)) | {"agents": old.layout.to_plain()}
+    with pytest.raises(CheckpointError, match=r"read the observations .*present.* not .*env\.observations\.critic"):
+        take_over("c.pt", given, fresh(now, True), now, other=REFITTED)
+
+
 def test_networks_of_another_width_are_refused(make_env: MakeEnv):
     before, now = make_env(), make_env(observations=ObservationConfig(goals=True))
     wide = DualActorCritic(layout_of(now), (32, 8), 1.0)

@@ -157,6 +157,7 @@ def test_paths_command_the_envs_that_they_lead(make_env, robot):
     env = make_env(16, robot=robot, path=PathConfig(share=0.5))
     active = env.path.active
     assert 0 < int(active.sum()) < 16
+    assert not env.commands.current().stand[active].any()
     torch.testing.assert_close(env.path.target_w, env.state.torso_pos_w[:, :2])
     env.path.target_w = env.path.target_w + env.state.heading_w[:, :2, 0]  # a metre ahead
     drive(env, 5, scale=0.0)

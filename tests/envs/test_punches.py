@@ -80,3 +80,7 @@ def test_no_force_no_punches():
 def test_bad_fields_are_named(field, value):
     with pytest.raises(ValueError, match=rf"punches\.{field}"):
         Punches(PunchConfig(**{field: value}), 8, 1, DT)
+
+
+def test_a_punch_may_fill_its_segment_however_the_sum_rounds():
+    PunchConfig(segment_s=0.3, first_s=0.1, duration_s=0.2).check()

@@ -214,6 +214,11 @@ def test_bad_fields_are_named(field, value):
         PushConfig(**{field: value}).check()
 
 
+@pytest.mark.parametrize(("hand", "link"), [(0.8, 0.2), (0.9, 0.1)])
+def test_shares_that_leave_nothing_are_allowed_however_they_round(hand, link):
+    PushConfig(hand_share=hand, link_share=link).check()
+
+
 def pushed_env(make_env, robot: str, num_envs: int, **cfg):
     forces = ExternalForceConfig(pushes=PushConfig(**{**BUSY, **cfg}))
     return make_env(num_envs, robot=robot, randomization=NOMINAL, forces=forces)

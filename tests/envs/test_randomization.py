@@ -143,3 +143,9 @@ def test_dynamics_follow_the_masses_that_were_drawn(make_env, robot):
 def test_bad_fields_are_named(field, value):
     with pytest.raises(ValueError, match=f"randomization.{field}"):
         RandomizationConfig(**{field: value}).check(0.02)
+
+
+def test_a_torso_without_mass_is_refused(make_env, robot):
+    heavy = make_env(1, robot=robot).spec.mass_kg  # the torso weighs less
+    with pytest.raises(ValueError, match=r"randomization\.base_mass_kg\[0\] .* would leave a torso of -"):
+        make_env(1, robot=robot, randomization=RandomizationConfig(base_mass_kg=(-heavy, 0.0)))

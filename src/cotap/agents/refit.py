@@ -11,7 +11,7 @@ import torch
 
 from cotap.agents.actors import DualActorCritic, as_dict
 from cotap.agents.checkpoint import MALFORMED, CheckpointError, load_weights, require_layout, same
-from cotap.checks import reason_of
+from cotap.checks import quoted, reason_of
 
 REFITTED = ("terms", "critic_terms", "modulation")
 """What two layouts may differ in for `refit` to go from one to the other."""
@@ -47,6 +47,12 @@ def take_over(
     present, saved = json.loads(json.dumps(env.layout())), content["layout"]
     refits = any(not same(saved.get(key), present.get(key)) for key in other)
     require_layout(path, saved, {k: v for k, v in present.items() if k not in other})
+    reads = content.get("agents", {}).get("obs_groups", model.layout.obs_groups)
+    if reads != model.layout.obs_groups:
+        raise CheckpointError(
+            f"checkpoint {path!r} has networks that read the observations {quoted(reads)}, not "
+            f"{model.layout.obs_groups}: --env.observations.critic and --env.observations.noise.enabled choose them"
+        )
     try:
         if refits:
             # For the statistics of what is new.

@@ -59,9 +59,18 @@ MODEL = ("collision", "unevenness_m", "fixed_base")
 
 
 def layout_of(env: VecEnv, symmetric: bool = True) -> AgentLayout:
-    """Sizes, action slices, observation groups and mirror images (if it has any), asked of the environment."""
+    """Sizes, action slices, observation groups and mirror images (if it has any), asked of the environment.
+
+    Raises:
+        ValueError: its groups of rewards are not those of its actions, in one order.
+    """
     widths = {group: value.shape[-1] for group, value in env.get_observations().items()}
     groups, slices = env.obs_groups, env.action_slices  # pyright: ignore[reportAttributeAccessIssue]
+    rewarded = tuple(getattr(env, "reward_groups", slices))
+    if rewarded != tuple(slices):
+        raise ValueError(
+            f"reward groups {rewarded} must name the agents in the order of their actions, {tuple(slices)}"
+        )
     return AgentLayout(widths, groups, slices, getattr(env, "symmetry", None) if symmetric else None)
 
 
@@ -118,8 +127,10 @@ class TrainingFault(RuntimeError):
 
 
 class DualRunner:
-    """Trains two agents in an rsl_rl `VecEnv`, and saves all that the run depends on. The environment needs
-    `action_slices`, `obs_groups` and `state_dict`.
+    """Trains two agents in an rsl_rl `VecEnv`, and saves all that the run depends on. The environment needs what
+    `HumanoidEnv` has beside: `obs_groups` of actors and critics, `action_slices` and `reward_groups` of the agents,
+    `layout()`, `samples`, `curriculum`, `state_dict()` and `load_state_dict()`, and `group_rewards`, `time_outs` and
+    `log` among its extras.
 
     Args:
         env: The environment.
@@ -294,7 +305,7 @@ class DualRunner:
 
     def load(self, path: str) -> None:
         """Load a checkpoint of a run. Simulator states that it lacks, or that are of another number of envs or ranks,
-        or of other collisions, start afresh.
+        or of another model (`MODEL`), start afresh.
 
         Raises:
             CheckpointError: the file cannot be used, or was trained for another robot or observation layout.
@@ -318,7 +329,8 @@ class DualRunner:
                 say(f"{path}: no simulator states for this run; starting those afresh")
         except MALFORMED as error:
             raise CheckpointError(
-                f"checkpoint {path!r} has states that do not fit this run: {reason_of(error)}"
+                f"checkpoint {path!r} has states that do not fit this run: {reason_of(error)} (where only the envs' "
+                "configuration is another, another --num-envs starts them afresh)"
             ) from error
 
     def _share_of(self, content: dict[str, Any]) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """Recipes of stage 1: PD control on all joints; legs follow commands, arms a reference.
 
-A recipe declares all that differs from the defaults. What ships is `default`, from nothing, in one run.
+A recipe declares all that differs from the defaults. What is to ship is `default`, from nothing, in one run.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class BaseTraining:
 
 
 def default(robot: str = "h1") -> BaseTraining:
-    """What ships: walks, stands, bears loads on the hands, and takes pushes; 300 M samples."""
+    """What is to ship: walks, stands, bears loads on the hands, and takes pushes; 300 M samples."""
     training = BaseTraining(
         env=HumanoidEnvConfig(
             robot=robot,

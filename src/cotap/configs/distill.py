@@ -59,7 +59,7 @@ def quick(base: BaseTraining) -> DistillTraining:
 
 def paper(base: BaseTraining) -> DistillTraining:
     """The paper's range of stiffness (its Table II), drawn uniformly, PD's damping, no pushes, and as many samples as
-    its 20,000 iterations of 4096 envs have. All else is the base's: begin with one of recipe `paper`."""
+    its 20,000 iterations of 4096 envs have. All else is as in `default`: begin with a base of recipe `paper`."""
     training = default(base)
     pd_damped = LawConfig(name="cotap", damping="pd")
     sampling = LawSampling(enabled=True, stiffness=(150.0, 450.0), log_uniform=False)

@@ -68,7 +68,7 @@ class Actuation(Stateful):
             return
         self.arm_effort.zero_()
         self.upper_body.send(state, target[:, self._arms], arm_velocity)
-        # The simulator integrates the stiffness' diagonal.
+        # The simulator integrates the damping's diagonal implicitly; `drive` takes the stiffness' out again.
         kp, kd = self.upper_body.implicit_gains()
         self._kp[:, self._arms], self._kd[:, self._arms] = kp, kd
         bias = self._sim.field("actuator_biasprm")

@@ -52,7 +52,7 @@ class ExternalForces:
         self, cfg: ExternalForceConfig, spec: RobotSpec, model: mujoco.MjModel, reader: StateReader,
         torque_limit: torch.Tensor, num_envs: int, dt: float,
     ) -> None:  # fmt: skip
-        self._cfg, self._dt, self._chains, self._torque_limit = cfg, dt, reader.arm_chains, torque_limit
+        self._cfg, self._chains, self._torque_limit = cfg, reader.arm_chains, torque_limit
         self._hand_bodies = [model.body(arm.hand_body).id for arm in spec.arms]
         links = {body.joint: body for body in spec.bodies}
         struck = [links[name] for name in spec.joint_names]

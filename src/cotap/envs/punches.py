@@ -44,7 +44,7 @@ class PunchConfig:
         require_range("punches.force_n", self.force_n, 0.0, 1e5)
         require_range("punches.duration_s", self.duration_s, 0.0, 1e3)
         require_range("punches.first_s", self.first_s, 0.0, 1e3)
-        require_range("punches.segment_s", self.segment_s, self.first_s + self.duration_s, 1e6)
+        require_range("punches.segment_s", self.segment_s, round(self.first_s + self.duration_s, 9), 1e6)
         require_positive_int("punches.count", self.count)
         require_range("punches.ramp_s", self.ramp_s, 1e-3, 1e6)
         require_range("punches.seed", self.seed, 0, 2**64)

@@ -49,7 +49,7 @@ class PushConfig:
         require_range("pushes.interval_s[0]", self.interval_s[0], self.duration_s[1], 1e6)
         require_range("pushes.episode_share", self.episode_share, 0.0, 1.0)
         require_range("pushes.hand_share", self.hand_share, 0.0, 1.0)
-        require_range("pushes.link_share", self.link_share, 0.0, 1.0 - self.hand_share)
+        require_range("pushes.link_share", self.link_share, 0.0, round(1.0 - self.hand_share, 9))
         require_range("pushes.beside_base", self.beside_base, 0.0, 1e3)
         require_range("pushes.largest_pitch", self.largest_pitch, 0.0, 0.5 * math.pi)
         self.ramp.check("pushes.ramp")

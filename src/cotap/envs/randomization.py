@@ -55,6 +55,11 @@ class Randomizer(Stateful):
         feet = {model.body(foot.body).id for foot in spec.feet}
         self._foot_geoms = [g for g in range(model.ngeom) if model.geom_bodyid[g] in feet and model.geom_contype[g]]
         self._torso = model.body(spec.torso_body).id
+        lightest = model.body_mass[self._torso] * cfg.link_mass_scale[0] + cfg.base_mass_kg[0]
+        if cfg.enabled and lightest <= 0.0:
+            raise ValueError(
+                f"randomization.base_mass_kg[0] {cfg.base_mass_kg[0]} would leave a torso of {lightest:.1f} kg"
+            )
         self._kp = torch.tensor([j.kp for j in spec.joints], dtype=torch.float64)
         self._kd = torch.tensor([j.kd for j in spec.joints], dtype=torch.float64)
         self.kp_scale = torch.ones(sim.num_envs, len(spec.joints))

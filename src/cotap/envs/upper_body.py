@@ -277,7 +277,7 @@ class UpperBody(Stateful):
         return self._law(1)
 
     def implicit_gains(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Diagonals (N, U) of stiffness and damping in force, which the simulator may integrate implicitly."""
+        """Diagonals (N, U) of stiffness and damping in force; the simulator integrates the second implicitly."""
         diagonals = (torch.diagonal(m[1], dim1=-2, dim2=-1).flatten(1) for m in (self._stiffness, self._damping))
         stiffness, damping = diagonals
         return stiffness, damping
