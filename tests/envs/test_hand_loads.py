@@ -11,6 +11,7 @@ from env_tools import NOMINAL, drive, mujoco_of, zeros
 from cotap.envs.curriculum import RampConfig
 from cotap.envs.external_forces import ExternalForceConfig
 from cotap.envs.hand_loads import HandLoadConfig, HandLoads
+from cotap.robots import h1
 
 DT = 0.02
 STRONG = torch.full((2, 4), 1e6)
@@ -40,6 +41,12 @@ def test_draws_follow_ranges_and_shares(rng):
         assert high - 0.1 < float(values.max()) <= high
         assert float((values == 0).float().mean()) == pytest.approx(0.25, abs=0.01)
     assert abs(float(torch.corrcoef(force[:, :, 0].T)[0, 1])) < 0.05  # hands differ
+
+
+def test_loads_are_in_proportion_to_mass(make_env, robot):
+    env = make_env(200, robot=robot, forces=ExternalForceConfig(HandLoadConfig(enabled=True, episode_share=1.0)))
+    largest = 50.0 * env.spec.mass_kg / h1().mass_kg
+    assert float(-env.forces.hand_loads._force_h.min()) == pytest.approx(largest, rel=0.02)
 
 
 def test_loads_hold_for_their_time(rng):
@@ -171,7 +178,7 @@ def test_bad_fields_are_named(cfg, match):
 
 def test_arms_can_hold_what_robots_carry(make_env, robot):
     """Torques by MuJoCo's own Jacobian at the hands: within the share, and at it where the load is cut."""
-    share = 0.3
+    share = 0.2
     cfg = HandLoadConfig(enabled=True, episode_share=1.0, zero_probability=0.0, torque_share=share)
     env = make_env(8, robot=robot, randomization=NOMINAL, forces=ExternalForceConfig(hand_loads=cfg))
     drive(env, 5)

@@ -76,7 +76,7 @@ def default(robot: str = "h1") -> BaseTraining:
         ),
         runner=RunnerConfig(iterations=12_207),
     )
-    if robot == "g1":  # three joints in the waist, and two thirds of the weight under the same loads
+    if robot == "g1":  # three joints in the waist; it learned to walk where few hands were loaded
         training.env.actions.waist_share = 0.5
         training.env.forces.hand_loads.episode_share = 0.2
     return training

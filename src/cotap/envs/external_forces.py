@@ -15,7 +15,7 @@ from cotap.envs.punches import PunchConfig, Punches
 from cotap.envs.pushes import PushConfig, Pushes
 from cotap.envs.scripted_forces import ForceProfile, ScriptedForces
 from cotap.envs.state import RobotState, StateReader
-from cotap.robots import RobotSpec
+from cotap.robots import ROBOTS, RobotSpec
 from cotap.robots.chains import LinkRotations
 from cotap.rotations import rotate
 
@@ -68,7 +68,7 @@ class ExternalForces:
         self._place_bodies = torch.tensor([base, *self._hand_bodies, *moving])
         """The body that each of a push's places is on."""
         self._base = base
-        self.hand_loads = HandLoads(cfg.hand_loads, hands, num_envs, dt)
+        self.hand_loads = HandLoads(cfg.hand_loads, hands, num_envs, dt, spec.mass_kg / ROBOTS["h1"]().mass_kg)
         self.pushes = Pushes(cfg.pushes, hands, len(moving), spec.mass_kg, num_envs, dt)
         self.punches = Punches(cfg.punches, len(spec.joints), num_envs, dt)
         self.scripted = ScriptedForces(cfg.scripted, tuple(arm.side for arm in spec.arms), num_envs, dt)

@@ -13,7 +13,7 @@ from cotap.persistence import Stateful, uniform
 
 @dataclass
 class HandLoadConfig:
-    """Random forces on the hands (FALCON's), in the heading frame."""
+    """Random forces on the hands (FALCON's), in the heading frame: those of an H1; for others in proportion to mass."""
 
     enabled: bool = False
     """Whether hands are loaded at all; training switches it on."""
@@ -51,9 +51,9 @@ class HandLoads(Stateful):
 
     STATE = ("_force_h", "_coming_h", "_remaining_s", "_loaded")
 
-    def __init__(self, cfg: HandLoadConfig, num_hands: int, num_envs: int, dt: float) -> None:
+    def __init__(self, cfg: HandLoadConfig, num_hands: int, num_envs: int, dt: float, scale: float = 1.0) -> None:
         cfg.check()
-        self.cfg, self._dt = cfg, dt
+        self.cfg, self._dt, self._scale = cfg, dt, scale
         self._force_h, self._coming_h = torch.zeros(2, num_envs, num_hands, 3)
         self._remaining_s = torch.zeros(num_envs)
         self._loaded = torch.ones(num_envs, dtype=torch.bool)
@@ -77,7 +77,7 @@ class HandLoads(Stateful):
         if n == 0:
             return
         force = torch.stack([uniform(rng, *b, n, hands) for b in (cfg.force_x, cfg.force_y, cfg.force_z)], -1)
-        force *= torch.rand(n, hands, 3, generator=rng, device=rng.device) >= cfg.zero_probability
+        force *= self._scale * (torch.rand(n, hands, 3, generator=rng, device=rng.device) >= cfg.zero_probability)
         self._force_h[mask], self._coming_h[mask] = self._coming_h[mask], force
         self._remaining_s[mask] = uniform(rng, *cfg.hold_s, n)
 

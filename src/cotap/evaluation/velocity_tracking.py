@@ -37,7 +37,8 @@ class VelocityTracking(RolloutProtocol):
     stand_probability: float = 0.2
     """Share of commands that are to stand."""
     hand_loads: bool = False
-    """Put random loads on both hands. x and y up to 40 N, z from -50 to 5 N, held for 3 to 5 s."""
+    """Put random loads on both hands. On an H1, x and y up to 40 N, z from -50 to 5 N; on others in proportion to
+    their mass. Each is held for 3 to 5 s."""
     follow_path: bool = False
     """Lead the torso along the root path of the clips. This takes the place of random commands."""
     collision: str = ""
