@@ -16,7 +16,7 @@ from cotap.sim import Simulation
 
 
 class Actuation(Stateful):
-    """Drives the simulation's actuators, which subtract `kp q + kd dq` themselves.
+    """Drives the simulation's actuators, which subtract `kp q + kd dq` themselves; under laws, arms' only `kd dq`.
 
     Commands take effect `delay_s` after they were sent, with 0 <= delay_s <= the control step. Within the physics step
     in which a command arrives, old and new are mixed by the share of the step that each holds, so that any delay, not
@@ -68,11 +68,11 @@ class Actuation(Stateful):
             return
         self.arm_effort.zero_()
         self.upper_body.send(state, target[:, self._arms], arm_velocity)
-        # The simulator integrates the damping's diagonal implicitly; `drive` takes the stiffness' out again.
-        kp, kd = self.upper_body.implicit_gains()
-        self._kp[:, self._arms], self._kd[:, self._arms] = kp, kd
+        # The simulator integrates the damping's diagonal implicitly, and knows nothing of the stiffness.
+        kd = self.upper_body.implicit_damping()
+        self._kd[:, self._arms] = kd
         bias = self._sim.field("actuator_biasprm")
-        bias[:, self._arms, 1], bias[:, self._arms, 2] = -kp.to(bias), -kd.to(bias)
+        bias[:, self._arms, 1], bias[:, self._arms, 2] = 0.0, -kd.to(bias)
 
     def arrived(self, substep: int) -> torch.Tensor:
         """Share (N,) of physics step number `substep` in which the newest command holds."""
@@ -88,7 +88,7 @@ class Actuation(Stateful):
             dq = self._sim.qvel[:, 6 + self._first_arm :].float()
             torque = self._arm_torque(q, dq, arrived)
             self.arm_effort += torque.clamp(-limit, limit) / self._sim.substeps
-            control[:, arms] = torque + self._kp[:, arms] * q + self._kd[:, arms] * dq
+            control[:, arms] = torque + self._kd[:, arms] * dq
         return control
 
     def joint_torque(self, state: RobotState) -> torch.Tensor:

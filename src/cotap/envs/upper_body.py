@@ -276,11 +276,9 @@ class UpperBody(Stateful):
         """What the laws answered last."""
         return self._law(1)
 
-    def implicit_gains(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Diagonals (N, U) of stiffness and damping in force; the simulator integrates the second implicitly."""
-        diagonals = (torch.diagonal(m[1], dim1=-2, dim2=-1).flatten(1) for m in (self._stiffness, self._damping))
-        stiffness, damping = diagonals
-        return stiffness, damping
+    def implicit_damping(self) -> torch.Tensor:
+        """Diagonal (N, U) of the damping in force, which the simulator integrates implicitly."""
+        return torch.diagonal(self._damping[1], dim1=-2, dim2=-1).flatten(1)
 
     def state_dict(self) -> dict[str, Any]:
         """Its own state, the laws' parameters and memories, and what hands have felt."""
