@@ -47,10 +47,10 @@ def take_over(
     present, saved = json.loads(json.dumps(env.layout())), content["layout"]
     refits = any(not same(saved.get(key), present.get(key)) for key in other)
     require_layout(path, saved, {k: v for k, v in present.items() if k not in other})
-    reads = content.get("agents", {}).get("obs_groups", model.layout.obs_groups)
-    if reads != model.layout.obs_groups:
+    agents = content.get("agents")
+    if isinstance(agents, dict) and not same(agents.get("obs_groups"), model.layout.obs_groups):
         raise CheckpointError(
-            f"checkpoint {path!r} has networks that read the observations {quoted(reads)}, not "
+            f"checkpoint {path!r} has networks that read the observations {quoted(agents.get('obs_groups'))}, not "
             f"{model.layout.obs_groups}: --env.observations.critic and --env.observations.noise.enabled choose them"
         )
     try:
