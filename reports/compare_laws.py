@@ -156,10 +156,11 @@ class Static:
 
 
 def _displacement(got: float | None, half: float | None, ideal: float) -> str:
-    """A mean with the half of its interval [cm], and its error as a share of the ideal."""
-    if got is None or half is None:
+    """A mean with the half of its interval, if it has one [cm], and its error as a share of the ideal."""
+    if got is None:
         return "-"
-    return f"{100.0 * got:.1f}±{100.0 * half:.1f} ({got / ideal - 1.0:+.0%})"
+    interval = "" if half is None else f"±{100.0 * half:.1f}"
+    return f"{100.0 * got:.1f}{interval} ({got / ideal - 1.0:+.0%})"
 
 
 def _half_interval(std: float, envs: int) -> float | None:

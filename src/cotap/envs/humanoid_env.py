@@ -256,13 +256,13 @@ class HumanoidEnv(VecEnv):
 
     def _restart(self, mask: torch.Tensor, start: tuple[torch.Tensor, torch.Tensor] | None = None) -> None:
         """Begin new episodes in the n envs of `mask` (N,), from `qpos` (n, 7 + J) and `qvel` (n, 6 + J) if given."""
-        rng = self.rng if self.redraws else self.rng.clone_state()
+        before = None if self.redraws else self.rng.get_state()
         if self.redraws:
-            self.randomizer.randomize_episode(mask, self.actuation.delay_s, rng)
+            self.randomizer.randomize_episode(mask, self.actuation.delay_s, self.rng)
             for part in (self.commands, self.motions, self.forces):
-                part.reset(mask, rng)
-        self.upper_body.reset(mask, rng)
-        qpos, qvel = start or start_state(self.cfg, self.spec, self.motions.current().position[mask], rng)
+                part.reset(mask, self.rng)
+        self.upper_body.reset(mask, self.rng)
+        qpos, qvel = start or start_state(self.cfg, self.spec, self.motions.current().position[mask], self.rng)
         self.sim.reset(mask, qpos, qvel)
         self.actuation.reset(mask, qpos[:, 7:])
         for held in (self.observer, self.recorder):
@@ -274,7 +274,9 @@ class HumanoidEnv(VecEnv):
         else:
             ids = mask.nonzero().squeeze(1)
             self.state = self.state.with_envs(ids, self.reader.read(ids))
-        self.path.reset(mask, self.state.torso_pos_w[:, :2], self.state.heading_w, rng)
+        self.path.reset(mask, self.state.torso_pos_w[:, :2], self.state.heading_w, self.rng)
+        if before is not None:
+            self.rng.set_state(before)
         if self.cfg.path.share > 0.0:  # those that are led are told to walk from their first observation on
             still = torch.zeros_like(self.state.torso_pos_w)
             self.commands.set_velocity(still[:, :2], still[:, 2], self.path.active & mask)
