@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import sys
 
 from cotap.command_help import Command, load_commands, show, unknown
@@ -13,7 +14,17 @@ _EXTRAS = {"play": "play", "export": "deploy", "deploy": "deploy"}
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run a command. Returns the exit status: 0, 2 for bad input, or the command's own."""
+    """Run a command. Returns the exit status: 0, 2 for bad input, 1 if nobody reads on, or the command's own."""
+    try:
+        status = _answer(argv)
+        sys.stdout.flush()
+    except BrokenPipeError:  # as of `| head`; what is left to be written at the end goes nowhere
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    return status
+
+
+def _answer(argv: list[str] | None) -> int:
     args = list(sys.argv[1:] if argv is None else argv)
     commands = load_commands()
     name, rest = _named(args, commands)
