@@ -673,6 +673,13 @@ def test_a_pipeline_goes_on_with_the_options_that_it_began_with(tmp_path: Path, 
         train_both(PipelineOptions(run_dir=str(out), resume=True, robot="g1"), stage)
     with pytest.raises(ValueError, match=r"already holds 'base/checkpoint_001220\.pt': go on with --resume"):
         train_both(PipelineOptions(run_dir=str(out)), stage)
+    kept = (out / "pipeline.json").read_bytes()
+    with sole_writer(out), pytest.raises(ValueError, match="another training writes to"):
+        train_both(PipelineOptions(run_dir=str(out), resume=True, threads=2), stage)
+    assert (out / "pipeline.json").read_bytes() == kept
+    (out / "pipeline.json").write_text("[" * 100_000)
+    with pytest.raises(ValueError, match="has no usable options"):
+        train_both(PipelineOptions(run_dir=str(out), resume=True), stage)
     (out / "pipeline.json").write_text("{")
     with pytest.raises(ValueError, match="has no usable options"):
         train_both(PipelineOptions(run_dir=str(out), resume=True), stage)

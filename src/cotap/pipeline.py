@@ -107,6 +107,7 @@ def train_both(options: PipelineOptions, run_stage: RunStage) -> Path:
         Stopped: a stage was asked to stop.
     """
     from cotap.agents.ranks import Ranks
+    from cotap.agents.runner import sole_writer
 
     options.check()
     if Ranks.from_environment().size > 1:
@@ -117,12 +118,13 @@ def train_both(options: PipelineOptions, run_stage: RunStage) -> Path:
     else:
         _require_unused(run_dir, "go on with --resume, or choose another --run-dir")
         print(expected(options), flush=True)
-    run_dir.mkdir(parents=True, exist_ok=True)
-    write_json(run_dir / BEGUN_WITH, to_plain(options))
     base_steps, distill_steps = options.iterations()
     recipe = ["--recipe", options.chosen]
-    base = _part(options, run_dir / "base", base_steps, [*recipe, "--robot", options.robot], run_stage)
-    _part(options, run_dir / "distill", distill_steps, [*recipe, "--base-checkpoint", str(base)], run_stage)
+    run_dir.mkdir(parents=True, exist_ok=True)
+    with sole_writer(run_dir):
+        write_json(run_dir / BEGUN_WITH, to_plain(options))
+        base = _part(options, run_dir / "base", base_steps, [*recipe, "--robot", options.robot], run_stage)
+        _part(options, run_dir / "distill", distill_steps, [*recipe, "--base-checkpoint", str(base)], run_stage)
     print(_summary(run_dir), end="")
     return run_dir
 
@@ -148,7 +150,7 @@ def _gone_on_with(options: PipelineOptions, run_dir: Path) -> PipelineOptions:
         return options
     try:
         begun = from_plain(PipelineOptions, json.loads(path.read_text(encoding="utf-8")))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:  # the last of values nested without end
         raise ValueError(f"{str(path)!r} has no usable options: {reason_of(error)}") from error
     default = PipelineOptions()
     for name in (field.name for field in fields(options)):
