@@ -110,7 +110,7 @@ def verdict(change: dict[str, Any]) -> str:
     if change["mean"] is None:
         return relative(change)
     low, high = change["ci95"]
-    word = "holds" if high <= -BETTER else "does not hold" if low > -BETTER else "cannot be told"
+    word = "holds" if high <= -BETTER else "does not hold" if low > -BETTER else "undecided"
     return f"**{word}**, {relative(change)}"
 
 
@@ -134,7 +134,7 @@ def within(rows: list[dict[str, Any]], allowed: float) -> str:
     intervals = [r["ci95"] for r in measured]
     if None in intervals or any(low > allowed or high < -allowed for low, high in intervals):
         return "no"
-    return "**yes**" if all(-allowed <= low and high <= allowed for low, high in intervals) else "cannot be told"
+    return "**yes**" if all(-allowed <= low and high <= allowed for low, high in intervals) else "undecided"
 
 
 def single_hands(quantiles: dict[str, float | None] | None, intervals: dict[str, list[float | None]] | None) -> str:

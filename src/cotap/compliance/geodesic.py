@@ -14,12 +14,14 @@ from typing import NamedTuple
 
 import torch
 
-from cotap.compliance.arguments import symmetric_part
+from cotap.compliance.arguments import symmetric_part, values_are_known
 from cotap.compliance.spd import log_from_eigenvectors
 
 _ITERATIONS = 24
-"""Of the search for a share. Each goes down by one over the largest rate, or more, and squares what is left once it is
-small."""
+"""At most, of the search for a share. Each goes down by one over the largest rate, or more, and squares what is left
+once it is small."""
+_CLOSE = 1e-12
+"""Step of that search which ends it, if no arm's is larger. Mostly the fifth."""
 
 
 class HeldStiffness(NamedTuple):
@@ -116,7 +118,9 @@ def _largest_share(weights: torch.Tensor, rates: torch.Tensor, bound: torch.Tens
     share = torch.ones_like(bound)
     for _ in range(_ITERATIONS):
         over, slope = excess(share)
-        share = (share - over / torch.where(slope > 0.0, slope, torch.inf)).clamp(0.0, 1.0)
+        before, share = share, (share - over / torch.where(slope > 0.0, slope, torch.inf)).clamp(0.0, 1.0)
+        if values_are_known() and (share >= before - _CLOSE).all():
+            break
     over, slope = excess(share)
     over = over.clamp_min(0.0)
     bend = 0.25 * (rates.amax(-1) - rates.amin(-1)).square()

@@ -145,6 +145,8 @@ class Remembering:
         held = self.memory.get(name)
         if held is None:
             return initial
+        if not state.fresh.any():
+            return held
         return torch.where(state.fresh[(..., *[None] * (initial.dim() - 2))], initial, held)
 
     def take_over(self, env: int, arm: int, other: dict[str, torch.Tensor], like: torch.Tensor) -> bool:

@@ -277,7 +277,7 @@ class HumanoidEnv(VecEnv):
         self.path.reset(mask, self.state.torso_pos_w[:, :2], self.state.heading_w, self.rng)
         if before is not None:
             self.rng.set_state(before)
-        if self.cfg.path.share > 0.0:  # those that are led are told to walk from their first observation on
+        if self.cfg.path.share > 0.0:  # those that are led walk from their first observation on
             still = torch.zeros_like(self.state.torso_pos_w)
             self.commands.set_velocity(still[:, :2], still[:, 2], self.path.active & mask)
 
