@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import mujoco
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from cotap.robots.mjcf import build_model
 def overlap(model: mujoco.MjModel, names: list[str], pose: np.ndarray, spec) -> float:
     """How deep shapes overlap [m] with the named joints at `pose` and all others in the default pose."""
     data = mujoco.MjData(model)
+    data.qpos[2] = 10.0  # the ground is not a part of the robot
     for joint in spec.joints:
         data.joint(joint.name).qpos = joint.default_rad
     for name, angle in zip(names, pose, strict=True):
@@ -43,6 +46,13 @@ def test_a_bound_that_came_in_is_where_the_arm_meets_the_body(any_spec, model):
             assert overlap(model, [name], np.array([new]), any_spec) <= met
             if abs(old - new) > STEP_RAD:
                 assert overlap(model, [name], np.array([new + sign * 1.01 * STEP_RAD]), any_spec) > met
+
+
+def test_where_the_robots_file_has_its_base_does_not_count(any_spec):
+    first, *rest = any_spec.bodies
+    low = dataclasses.replace(any_spec, bodies=(dataclasses.replace(first, pos=(0.0, 0.0, 0.0)), *rest))
+    for bound, same in zip(clear_range(any_spec, *wide(any_spec)), clear_range(low, *wide(any_spec)), strict=True):
+        assert torch.equal(bound, same)
 
 
 def test_few_random_poses_of_arms_are_inside_the_body(any_spec, model):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ from test_formats import write_amass, write_lafan
 from cotap.motions import MotionLibrary
 from cotap.motions import show as show_module
 from cotap.motions.__main__ import main
+from cotap.motions.library import shipped_library
 
 
 def test_import_writes_a_library_and_a_table(tmp_path: Path, spec, capsys):
@@ -75,6 +77,26 @@ def test_import_reads_at_the_rate_that_is_given(tmp_path: Path, spec, capsys):
     assert main(["import", str(tmp_path / "walk.csv"), "--output", out, "--fps", "0"]) == 2
     assert "--fps must be in [1, 10000] Hz, got 0.0" in capsys.readouterr().err
     assert MotionLibrary.load(out, spec).clips[0].seconds == pytest.approx(1.5)  # the old file is untouched
+
+
+def test_an_import_does_not_read_what_it_writes(tmp_path: Path, spec, capsys):
+    write_lafan(tmp_path / "walk.csv")
+    out = tmp_path / "mine.npz"
+    assert main(["import", str(tmp_path), "--output", str(out)]) == 0
+    assert main(["import", str(tmp_path), "--output", str(out)]) == 2
+    assert "mine.npz' is one of the files to be read; write it elsewhere" in capsys.readouterr().err
+    assert MotionLibrary.load(out, spec).names() == ["walk"]
+
+
+def test_no_picture_takes_the_name_of_another(tmp_path: Path, spec, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(show_module, "plot_clip", lambda path, *_: path.touch())
+    monkeypatch.setattr(show_module, "_sheet", lambda path, *_: path.touch())
+    punch = shipped_library(spec).select(["punch"], spec).clips[0]
+    names = ["a/b", "a_b", "contact_sheet", "é" * 200]
+    library = MotionLibrary([dataclasses.replace(punch, name=name) for name in names], spec)
+    written = list(show_module.draw(library, spec, tmp_path))
+    assert sorted(written) == sorted(tmp_path.iterdir())
+    assert len(set(written)) == 5
 
 
 @pytest.mark.slow

@@ -44,5 +44,16 @@ def test_fast_passages_are_slowed_within_limits(any_spec):
     low, high = np.array([j.range_rad for j in joints]).T
     speed = np.array([j.velocity_limit_rad_s for j in joints])
     fast = 0.5 * (low + high) + np.sin(np.arange(30) / 50.0 * 2.0 * np.pi * 4.0)[:, None] * (high - low) * 0.4
-    before, after = (np.abs(np.diff(q, axis=0)) * 50.0 / speed for q in (fast, slow_down(any_spec, fast)))
+    slow = slow_down(any_spec, fast)
+    before, after = (np.abs(np.diff(q, axis=0)) * 50.0 / speed for q in (fast, slow))
     assert after.max() < 0.7 * before.max()
+    assert (slow >= low - 1e-6).all()
+    assert (slow <= high + 1e-6).all()
+    held = np.tile(fast.mean(0), (len(fast), 1))
+    went = forward_kinematics(any_spec, fast)[1:3]
+    off = [
+        np.linalg.norm(point - at, axis=-1).mean()
+        for q in (slow, held)
+        for point, at in zip(forward_kinematics(any_spec, q)[1:3], went, strict=True)
+    ]
+    assert max(off[:2]) < 0.5 * max(off[2:])  # of elbows and hands, against arms that hold still

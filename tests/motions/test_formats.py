@@ -15,7 +15,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from test_retarget import upper_arm_rotation
 
-from cotap.motions import MotionClip, MotionError, MotionLibrary
+from cotap.motions import MotionClip, MotionError, MotionLibrary, formats
 from cotap.motions.formats import FORMATS, detect_format
 from cotap.motions.importer import import_motions
 from cotap.motions.joblib_files import load_joblib
@@ -416,6 +416,35 @@ def test_unknown_suffixes_are_named(tmp_path):
     with pytest.raises(MotionError, match=r"no known suffix; known: \.txt"):
         detect_format(path)
     assert set(FORMATS) == {"deepmimic", "amass", "phc", "lafan", "npz"}
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_ball_elbow_becomes_a_hinge_whose_forearm_points_the_same_way(side):
+    """SMPL's arms point sideways at rest; left is x there, and up is y."""
+    rng = np.random.default_rng(0)
+    turns = {name: Rotation.from_rotvec(rng.normal(size=(50, 3))) for name in ("collar", "shoulder", "elbow")}
+    joint = {formats._AMASS_JOINTS[name][side]: turn.as_matrix() for name, turn in turns.items()}
+    upper, flexion = formats._smpl_arm(side, joint.__getitem__)
+    rest = [1.0 if side == "left" else -1.0, 0.0, 0.0]
+    arm = turns["collar"] * turns["shoulder"]
+    forearm = (arm * turns["elbow"]).apply(rest)[:, [2, 0, 1]]  # forward, left, up
+    bent = np.abs(np.sin(flexion)) > 0.2  # else the turn of the upper arm fades
+    hinge = np.stack((np.sin(flexion), 0.0 * flexion, -np.cos(flexion)), 1)
+    np.testing.assert_allclose((upper @ hinge[..., None])[bent, :, 0], forearm[bent], atol=1e-9)
+    np.testing.assert_allclose(-upper[:, :, 2], arm.apply(rest)[:, [2, 0, 1]], atol=1e-9)
+    assert bent.sum() > 40
+
+
+def test_a_file_that_is_named_twice_is_read_once(tmp_path, spec):
+    path = write_lafan(tmp_path / "walk.csv")
+    result = import_motions([path, tmp_path, tmp_path / ".." / tmp_path.name], spec, progress=False)
+    assert result.read == ["walk"]
+
+
+def test_a_mirrored_clip_alone_gets_its_image(tmp_path, spec):
+    shipped_library(spec).select(["dance_b_mirrored"], spec).save(tmp_path / "one.npz")
+    result = import_motions([tmp_path / "one.npz"], spec, mirror=True, progress=False)
+    assert [c.mirrored for c in result.clips] == [True, False]
 
 
 def test_a_library_keeps_whose_its_clips_are_and_has_no_image_twice(tmp_path, spec):

@@ -56,6 +56,7 @@ def test_acceleration_is_limited_and_the_path_is_kept(largest: float):
     assert rates(paced.arms)[1] <= 1.15 * largest
     assert paced.seconds < 1.5 * 4.0 * np.sqrt(178.0 / largest)
     np.testing.assert_allclose(paced.arms[:, 0], 0.5 * np.sin(2 * np.pi * 12.0 * paced.arms[:, 1]), atol=0.01)
+    np.testing.assert_allclose(paced.root[:, 0], 0.02 * (len(arms) - 1) * paced.arms[:, 1], atol=0.01)
 
 
 def test_clips_of_a_few_frames_stay_as_they_are():

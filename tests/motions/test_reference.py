@@ -69,6 +69,12 @@ def test_clips_and_places_are_drawn_evenly(spec, rng):
     assert torch.equal(p.clip, before)
 
 
+def test_root_velocity_sideways_by_hand():
+    """0.5 m/s to the left of a body that looks along y: along -x."""
+    root = torch.stack((-0.01 * torch.arange(5.0), torch.zeros(5), torch.full((5,), 0.5 * torch.pi)), 1)
+    torch.testing.assert_close(root_velocity(root), torch.tensor([[0.0, 0.5, 0.0]]).repeat(5, 1), atol=1e-5, rtol=0)
+
+
 def test_root_velocity_of_a_circle_by_hand():
     """1 m/s on a circle of 2 m: forward at 1 m/s, turning at 0.5 rad/s, nothing sideways."""
     angle = torch.arange(200) / 50.0 * 0.5

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cotap.motions.quality import forward_kinematics
+from cotap.motions.processing import JointMotion, make_clip
+from cotap.motions.quality import assess, forward_kinematics
 from cotap.motions.retarget import (
     ArmFrames,
     HumanMotion,
@@ -113,6 +116,30 @@ def test_retargeting_returns_the_joints_it_was_made_from(spec):
     np.testing.assert_allclose(retarget(spec, human(spec, joints)), joints, atol=1e-9)
 
 
+@pytest.mark.parametrize(("aside_deg", "direction_deg"), [(0.0, 2.0), (30.0, 30.0)])
+def test_quality_is_measured_against_the_human(spec, aside_deg, direction_deg):
+    """Joints that are exactly the human's; and the same beside a human who holds all of the arm aside."""
+    joints = np.concatenate((wave(5, [0.2, 0.0, -0.1, -0.8], [0.6, 0.1, 0.1, 0.8]),
+                             wave(6, [0.2, -0.1, -0.1, -0.8], [0.6, 0.0, 0.1, 0.8])), 1)  # fmt: skip
+    them = human(spec, joints)
+    turn = Rotation.from_euler("Y", aside_deg, degrees=True).as_matrix()
+    turned = {side: turn @ upper for side, upper in them.upper_arms.items()}
+    motion = JointMotion("made", them.times_s, joints, them.root, human=replace(them, upper_arms=turned))
+    clip, report = make_clip(spec, motion, "made", "none")
+    quality = assess(spec, motion, clip, report)
+    assert quality.hand_direction_error_deg == pytest.approx(direction_deg, abs=2.0)
+    assert quality.elbow_correlation > 0.99
+    reach = 2.0 * np.sin(np.radians(0.5 * aside_deg)) * 0.5
+    assert quality.hand_path_error_m == pytest.approx(reach, abs=0.06)
+
+
+@pytest.mark.parametrize(("elbow", "share"), [(0.5 * np.pi, 1.0), (0.0, 0.0)])
+def test_straight_arms_are_near_a_singularity(spec, elbow, share):
+    joints = np.tile([0.3, 0.2, 0.0, elbow, 0.3, -0.2, 0.0, elbow], (50, 1))
+    motion = JointMotion("made", np.arange(50) / 50.0, joints, np.zeros((50, 3)))
+    assert assess(spec, motion, *make_clip(spec, motion, "made", "none")).singular_fraction == share
+
+
 def test_branches_avoid_limits_and_jumps(spec):
     frames = arm_frames(spec, spec.arms[0])
     solutions = np.zeros((2, 5, 3))
@@ -126,8 +153,6 @@ def test_branches_avoid_limits_and_jumps(spec):
 
 
 def test_an_arm_of_another_kind_is_refused(spec):
-    from dataclasses import replace
-
     joints = tuple(replace(j, axis=(0.0, 0.0, 1.0)) if j.name == "left_elbow" else j for j in spec.joints)
     with pytest.raises(ValueError, match="left arm does not begin with shoulder pitch, roll, yaw and elbow"):
         arm_frames(replace(spec, joints=joints), spec.arms[0])
@@ -135,9 +160,30 @@ def test_an_arm_of_another_kind_is_refused(spec):
 
 def test_an_arm_that_is_straight_at_zero_is_refused(spec):
     """Its forearm would be sent up or back, a quarter turn from where it should be."""
-    from dataclasses import replace
-
     turned = (0.5**0.5, 0.0, 0.5**0.5, 0.0)
     bodies = tuple(replace(b, quat=turned) if b.joint == "left_elbow" else b for b in spec.bodies)
     with pytest.raises(ValueError, match=r"the left upper arm must point down and the forearm forward, .*turned"):
         arm_frames(replace(spec, bodies=bodies), spec.arms[0])
+
+
+@pytest.mark.parametrize(("axis", "refused"), [("X", False), ("Y", False), ("Z", True)])
+def test_a_shoulder_may_be_tilted_and_no_more(spec, axis, refused):
+    """Turned by half a radian, and back at the next link, so that the upper arm hangs as before."""
+    turn = Rotation.from_euler(axis, 0.5)
+
+    def turned(body):
+        own = Rotation.from_quat(body.quat, scalar_first=True)
+        if body.joint == "left_shoulder_pitch":
+            own = turn * own
+        elif body.joint == "left_shoulder_roll":
+            own = before.inv() * turn.inv() * before * own
+        return replace(body, quat=tuple(own.as_quat(scalar_first=True)))
+
+    (first,) = [b for b in spec.bodies if b.joint == "left_shoulder_pitch"]
+    before = Rotation.from_quat(first.quat, scalar_first=True)
+    other = replace(spec, bodies=tuple(turned(b) for b in spec.bodies))
+    if refused:
+        with pytest.raises(ValueError, match="the left shoulder must be tilted about x alone"):
+            arm_frames(other, spec.arms[0])
+    else:
+        arm_frames(other, spec.arms[0])

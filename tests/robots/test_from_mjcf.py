@@ -123,12 +123,37 @@ def test_what_cotap_makes_of_a_robot_gives_its_facts_back(any_spec, tmp_path):
         assert entry["mass"] == pytest.approx(body.mass_kg)
         np.testing.assert_allclose(entry["pos"], body.pos, atol=1e-9)
         np.testing.assert_allclose(entry["diaginertia"], body.diaginertia, rtol=1e-5)  # the XML has six digits
-        assert [g["type"] for g in entry["collision_geoms"]] == [g.type for g in body.collision]
+        assert len(entry["collision_geoms"]) == len(body.collision)
+        for shape, own in zip(entry["collision_geoms"], body.collision, strict=True):
+            assert shape["type"] == own.type
+            used = {"sphere": 1, "capsule": 2, "cylinder": 2}.get(own.type, 3)
+            np.testing.assert_allclose(shape["size"][:used], own.size[:used], atol=1e-6)
+            np.testing.assert_allclose(shape["pos"], own.pos, atol=1e-6)
+            assert abs(np.dot(shape["quat"], own.quat)) == pytest.approx(np.linalg.norm(own.quat), abs=1e-5)
         if body.joint:
             joint, own = entry["joint"], any_spec.joint(body.joint)
             assert (joint["mirror"], joint["mirror_sign"]) == (own.mirror_name, own.mirror_sign)
             assert joint["torque_limit_nm"] == own.torque_limit_nm
             assert tuple(joint["range_rad"]) == pytest.approx(own.range_rad)
+            assert joint["damping"] == pytest.approx(own.damping_nms_rad)
+            assert joint["armature"] == pytest.approx(own.armature_kg_m2, rel=1e-5)
+
+
+def test_a_mesh_that_collides_keeps_its_own_mass(tmp_path):
+    """A tetrahedron is a third of a half of the box around it, and its centre of mass is elsewhere."""
+    corners = '"0 0 0 0.2 0 0 0 0.1 0 0 0 0.1"'
+    foot = '<inertial mass="1" pos="0.03 0 -0.03" diaginertia="0.001 0.003 0.003"/>\n        <joint name="l_ankle"'
+    text = mjcf().replace('name="sole" vertex="', f'name="other" vertex={corners}/><mesh name="sole" vertex="')
+    assert foot in text
+    text = text.replace(foot, '<geom type="mesh" mesh="other"/><joint name="l_ankle"')
+    (tmp_path / "robot.xml").write_text(text)
+    model = mujoco.MjModel.from_xml_string(text)
+    (entry,) = [body for body in facts_of(tmp_path / "robot.xml")["bodies"] if body["name"] == "l_foot"]
+    theirs = model.body("l_foot")
+    assert entry["mass"] == pytest.approx(theirs.mass[0])
+    np.testing.assert_allclose(entry["com"], theirs.ipos, atol=1e-9)
+    np.testing.assert_allclose(entry["diaginertia"], theirs.inertia, rtol=1e-9)
+    assert [shape["type"] for shape in entry["collision_geoms"]] == ["box", "box"]
 
 
 def test_a_vector_has_a_line():
@@ -139,6 +164,8 @@ def test_a_vector_has_a_line():
 
 TWO_JOINTS = '<body name="odd"><joint name="a" axis="0 1 0"/><joint name="b" axis="0 0 1"/><geom size="0.1"/></body>'
 MESH = mjcf('<geom type="mesh" mesh="limb"/>').replace("<asset>", '<asset><mesh file="limb.stl"/>')
+EQUAL = '<equality><joint joint1="l_knee" joint2="l_ankle"/></equality><actuator>'
+TENDON = '<tendon><fixed stiffness="100"><joint joint="l_knee" coef="1"/></fixed></tendon><actuator>'
 LONE = '<body name="odd"><joint name="odd" axis="0 1 0" range="-9 9" actuatorfrcrange="-1 1"/><geom size="0.1"/></body>'
 
 
@@ -170,6 +197,12 @@ LONE = '<body name="odd"><joint name="odd" axis="0 1 0" range="-9 9" actuatorfrc
             "one body of the world must carry the robot, got hips, odd",
         ),
         (mjcf().replace('"box"', '"plane"'), "plane"),
+        (mjcf().replace("<actuator>", EQUAL), "equality constraints cannot be expressed, got 1"),
+        (mjcf().replace("<actuator>", TENDON), "tendons cannot be expressed, got 1"),
+        (
+            mjcf().replace('<body name="chest"', '<body name="chest" gravcomp="1"'),
+            "bodies with gravcomp cannot be .* 1",
+        ),
         ("<mujoco/>", "one body of the world must carry the robot, got none"),
         ("rubbish", r"robot\.xml' cannot be read: .*XML"),
         ("version https://git-lfs.github.com/spec/v1\n", r"MJCF '.*robot\.xml' is a Git LFS pointer"),
@@ -221,15 +254,17 @@ def test_what_is_no_file_or_names_what_a_terminal_obeys_is_refused_in_words(tmp_
     ("of_joint", "actuator", "limit"),
     [('actuatorfrcrange="-80 80"', 'forcerange="-25 25"', 25.0),
      ('actuatorfrcrange="-20 20"', 'forcerange="-25 25"', 20.0),
-     ("", 'forcerange="-5 5" gear="3"', 15.0), ("", 'ctrlrange="-7 7" gear="2"', 14.0)],
+     ("", 'forcerange="-5 5" gear="3"', 15.0), ("", 'ctrlrange="-7 7" gear="2"', 14.0),
+     ("", 'forcerange="-5 5"/><motor joint="a" ctrlrange="-7 7" gear="2"', 19.0),
+     ('actuatorfrcrange="-9 9"', 'forcerange="-5 5"/><motor joint="a"', 9.0)],
 )  # fmt: skip
 def test_the_least_of_all_torque_limits_counts(of_joint, actuator, limit):
-    """MuJoCo applies both: that of the actuator, then that of the joint."""
+    """MuJoCo applies both: that of each actuator, which add up, then that of the joint."""
     text = f"""<mujoco><worldbody><body><joint name="a" axis="0 1 0" {of_joint}/><geom size="0.1"/></body></worldbody>
     <actuator><motor joint="a" {actuator}/></actuator></mujoco>"""
     model = mujoco.MjModel.from_xml_string(text)
     assert _torque_limit(model, 0) == pytest.approx(limit)
     data = mujoco.MjData(model)
-    data.ctrl[0] = 1e3
+    data.ctrl[:] = 1e3
     mujoco.mj_forward(model, data)
     assert data.qfrc_actuator[0] == pytest.approx(limit)

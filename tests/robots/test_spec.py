@@ -71,9 +71,40 @@ def test_base_and_torso_are_two_bodies(any_spec):
         dataclasses.replace(any_spec, torso_body=any_spec.base_body)
 
 
-def test_the_left_foot_comes_first(any_spec):
-    with pytest.raises(ValueError, match="the left foot must come first, got 'right'"):
-        dataclasses.replace(any_spec, feet=any_spec.feet[::-1])
+def test_left_comes_before_right(any_spec):
+    for fields in ({"feet": any_spec.feet[::-1]}, {"feet": any_spec.feet[:1]}, {"arms": any_spec.arms[::-1]}):
+        with pytest.raises(ValueError, match=r"(feet|arms) must be 'left' and 'right', in this order, got \('"):
+            dataclasses.replace(any_spec, **fields)
+    exchanged = zip(any_spec.feet, reversed(any_spec.feet), strict=True)
+    feet = tuple(dataclasses.replace(other, side=foot.side) for foot, other in exchanged)
+    with pytest.raises(ValueError, match="the left foot must come first, got 'left'"):
+        dataclasses.replace(any_spec, feet=feet)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("velocity_limit_rad_s", 0.0, r"velocity_limit_rad_s must lie in \[1e-06, .*got 0"),
+        ("velocity_limit_rad_s", float("nan"), "velocity_limit_rad_s must .*nan"),
+        ("velocity_limit_rad_s", "12", "velocity_limit_rad_s must .*'12'"),
+        ("torque_limit_nm", -5.0, "torque_limit_nm must lie in .*got -5"),
+        ("kp", -1.0, "kp must lie in .*got -1"),
+        ("kd", float("nan"), "kd must .*nan"),
+        ("range_rad", (1.0, -1.0), "range_rad must begin below its end, got"),
+        ("range_rad", (2.0, 3.0), r"default_rad must lie in \[2.0, 3.0\]"),
+    ],
+)
+def test_numbers_of_a_joint_are_in_their_range(any_spec, field, value, message):
+    name = any_spec.joints[0].name
+    with pytest.raises(ValueError, match=f"joint '{name}': {message}"):
+        changed(any_spec, name, **{field: value})
+
+
+def test_an_arms_joints_lead_to_its_own_hand(any_spec):
+    left, right = any_spec.arms
+    crossed = dataclasses.replace(left, hand_body=right.hand_body, elbow_body=right.elbow_body)
+    with pytest.raises(ValueError, match="the left arm's joints must be those from the torso to its hand"):
+        dataclasses.replace(any_spec, arms=(crossed, right))
 
 
 def test_joints_that_pitch(any_spec):

@@ -25,6 +25,8 @@ def test_links_and_hinges_are_the_models(read, any_model, any_spec):
     for name in any_spec.joint_names:
         np.testing.assert_allclose(read.joint(name).range, any_model.joint(name).range)
         np.testing.assert_allclose(read.joint(name).damping, any_model.joint(name).damping)
+        most = any_spec.joint(name).torque_limit_nm
+        np.testing.assert_allclose(read.jnt_actfrcrange[read.joint(name).id], [-most, most])
     bodies = any_spec.bodies[1:]
     ours, theirs = (sum(m.body_mass[m.body(b.name).id] for b in bodies) for m in (any_model, read))
     assert theirs == pytest.approx(ours)

@@ -66,7 +66,7 @@ def mjcf(base: str = "") -> str:
   <asset><mesh name="sole" vertex="{_CORNERS}"/></asset>
   <worldbody>
     <geom type="plane" size="5 5 1"/>
-    <body name="hips" pos="0 0 1">
+    <body name="hips" pos="0 0 1" euler="0 0 40">
       <inertial mass="6" pos="0 0 -0.02" diaginertia="0.05 0.04 0.05"/>
       <geom type="sphere" size="0.09"/>{base}
       <body name="chest" pos="0 0 0.12">

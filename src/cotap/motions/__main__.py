@@ -10,7 +10,7 @@ from typing import NoReturn
 from cotap.checks import shortened
 from cotap.files import require_output
 from cotap.motions.formats import FORMATS
-from cotap.motions.importer import describe, import_motions, table
+from cotap.motions.importer import describe, find_files, import_motions, table
 from cotap.motions.library import MotionError, MotionLibrary, shipped_library
 from cotap.robots import ROBOTS
 
@@ -39,7 +39,9 @@ def make_parser() -> argparse.ArgumentParser:
         "--format", default="auto", choices=("auto", *FORMATS),
         help=f"Format of the files: {', '.join(FORMATS)} or auto. auto looks into each file. (default: auto)",
     )  # fmt: skip
-    importer.add_argument("--mirror", action="store_true", help="Add the left-right mirror image of every clip.")
+    importer.add_argument(
+        "--mirror", action="store_true", help="Add the left-right mirror image of every clip whose own is not there."
+    )
     importer.add_argument("--fps", type=float, metavar="HZ", help="Frame rate of the files, in place of what they say.")
     importer.add_argument("--source", default="not stated", help="Where the motion comes from. It is kept in the file.")
     importer.add_argument("--licence", default="not stated", help="Licence of the motion. It is kept in the file.")
@@ -47,7 +49,10 @@ def make_parser() -> argparse.ArgumentParser:
     shower.add_argument("file", nargs="?", type=Path, metavar="FILE", help="Library. By default the shipped one.")
     shower.add_argument("--clip", action="append", default=[], help="Only this clip. May be repeated.")
     shower.add_argument(
-        "--output", type=Path, metavar="DIR", help="Folder for pictures of the clips. Without it, nothing is drawn."
+        "--output",
+        type=Path,
+        metavar="DIR",
+        help="Folder for a picture of each clip, and of the first 24 in one. Without it, nothing is drawn.",
     )
     for command in (importer, shower):
         arms = "Whose arms they move, such as g1. (default: h1)"
@@ -60,6 +65,8 @@ def _import(options: argparse.Namespace) -> int:
         raise MotionError(f"--output must end in .npz, got {str(options.output)!r}")
     options.output.parent.mkdir(parents=True, exist_ok=True)
     require_output("--output", options.output)
+    if options.output.resolve() in {path.resolve() for path in find_files(options.sources)}:
+        raise MotionError(f"--output {str(options.output)!r} is one of the files to be read; write it elsewhere")
     spec = ROBOTS[options.robot]()
     result = import_motions(
         options.sources, spec, options.format, options.mirror, options.source, options.licence, sys.stderr.isatty(),

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from cotap.robots import RobotSpec
-from cotap.robots.mjcf import build_model
+from cotap.robots.mjcf import FIXED_BASE_LIFT_M, build_model
 
 STEP_RAD = 0.02
 TOUCHING_M = 0.002
@@ -28,6 +28,7 @@ def clear_range(spec: RobotSpec, low: torch.Tensor, high: torch.Tensor) -> tuple
     data = mujoco.MjData(model)
     address = [model.jnt_qposadr[model.joint(j.name).id] for j in spec.joints]
     default = data.qpos.copy()
+    default[:7] = 0.0, 0.0, spec.base_height_m + FIXED_BASE_LIFT_M, 1.0, 0.0, 0.0, 0.0  # no foot is to meet the floor
     default[address] = [j.default_rad for j in spec.joints]
     met_m = min(_nearest(model, data, default), 0.0) - TOUCHING_M
     bounds = []

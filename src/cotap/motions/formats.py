@@ -106,7 +106,9 @@ def read_library(path: Path, spec: RobotSpec, fps: float | None = None) -> Clips
         raise MotionError(f"{str(path)!r} is a motion library, which is at {FPS:g} Hz; --fps is for other formats")
     library = MotionLibrary.load(path, spec)
     names = set(library.names())
-    images = {c.name: c.mirrored or f"{c.name}_mirrored" in names for c in library.clips}
+    images = {
+        n: f"{n}_mirrored" in names or (n.endswith("_mirrored") and n.removesuffix("_mirrored") in names) for n in names
+    }
     return [(c.name, lambda c=c: _from_clip(c, images[c.name])) for c in library.clips]
 
 

@@ -63,6 +63,12 @@ class ArmReference:
     """(N, U) [rad/s]."""
 
 
+def within_limits(low: torch.Tensor, high: torch.Tensor, margin_rad: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Ranges (U,) brought in by a margin at either end; a joint that has no room for it keeps to its middle."""
+    margin = (0.5 * (high - low)).clamp_max(margin_rad)
+    return low + margin, high - margin
+
+
 class MotionGenerator(Stateful):
     """Plays segments, each a minimum-jerk move plus an enveloped oscillation, that join with zero velocity.
 
@@ -79,8 +85,8 @@ class MotionGenerator(Stateful):
         default = torch.tensor([j.default_rad for j in joints])
         low, high = torch.tensor([j.range_rad for j in joints]).unbind(1)
         self.default = default
-        low = torch.maximum(low + cfg.limit_margin_rad, default - cfg.range_rad)
-        high = torch.minimum(high - cfg.limit_margin_rad, default + cfg.range_rad)
+        low, high = within_limits(low, high, cfg.limit_margin_rad)
+        low, high = torch.maximum(low, default - cfg.range_rad), torch.minimum(high, default + cfg.range_rad)
         self._low, self._high = clear_range(spec, low, high)
         limit = torch.tensor([j.velocity_limit_rad_s for j in joints])
         self._speed = (cfg.velocity_share * limit).clamp_max(cfg.largest_speed)

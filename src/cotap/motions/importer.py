@@ -34,7 +34,10 @@ class ImportResult:
 
 
 def find_files(sources: Iterable[Path]) -> list[Path]:
-    """The files themselves, and all of known suffix below the folders, sorted. Raises MotionError for a missing one."""
+    """The files themselves, and all of known suffix below the folders, sorted; each file once.
+
+    Raises MotionError for a missing one.
+    """
     found: list[Path] = []
     for source in sources:
         if source.is_dir():
@@ -45,7 +48,7 @@ def find_files(sources: Iterable[Path]) -> list[Path]:
             raise MotionError(f"motion source {str(source)!r} does not exist")
     if not found:
         raise MotionError(f"no motion files there; suffixes looked for in folders: {', '.join(SUFFIXES)}")
-    return found
+    return list({path.resolve(): path for path in reversed(found)}.values())[::-1]
 
 
 def import_motions(

@@ -35,7 +35,7 @@ class JointMotion:
     clip: MotionClip | None = None
     """The clip of a motion library that it is, if it is one; source, licence and mirroring stay that clip's."""
     has_image: bool = False
-    """Whether its mirror image is there already: it lies beside it, or it is one itself."""
+    """Whether its mirror image is there already."""
 
 
 @dataclass(frozen=True)

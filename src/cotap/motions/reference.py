@@ -12,7 +12,7 @@ import torch
 
 from cotap.checks import require_interval, require_one_of, require_range
 from cotap.motions.clip_player import ClipPlayer
-from cotap.motions.generator import PEAK_SPEED, ArmReference, MotionConfig, MotionGenerator, minimum_jerk
+from cotap.motions.generator import PEAK_SPEED, ArmReference, MotionConfig, MotionGenerator, minimum_jerk, within_limits
 from cotap.motions.library import MotionError, MotionLibrary, has_shipped_library, library_sha256, shipped_library
 from cotap.motions.pace import pace
 from cotap.persistence import Stateful, uniform
@@ -108,11 +108,9 @@ def load_clips(cfg: ClipConfig, spec: RobotSpec, margin_rad: float = 0.0) -> Mot
     if not names:
         raise MotionError("clips.held_out leaves no clip to play")
     limit = np.array([j.velocity_limit_rad_s for j in spec.upper_joint_specs])
-    low, high = np.array([j.range_rad for j in spec.upper_joint_specs], np.float32).T
-    clips = (
-        replace(clip, arms=clip.arms.clip(low + margin_rad, high - margin_rad))
-        for clip in library.select(names, spec).clips
-    )
+    limits = torch.tensor([j.range_rad for j in spec.upper_joint_specs]).unbind(1)
+    low, high = (bound.numpy() for bound in within_limits(limits[0], limits[1], margin_rad))
+    clips = (replace(clip, arms=clip.arms.clip(low, high)) for clip in library.select(names, spec).clips)
     return MotionLibrary([pace(clip, cfg.velocity_share * limit, cfg.acceleration) for clip in clips], spec)
 
 
@@ -133,7 +131,7 @@ class ReferenceMotion(Stateful):
         joints = spec.upper_joint_specs
         low, high = torch.tensor([j.range_rad for j in joints]).unbind(1)
         margin = cfg.generator.limit_margin_rad
-        self._low, self._high = low + margin, high - margin
+        self._low, self._high = within_limits(low, high, margin)
         self.clips = (
             ClipPlayer(load_clips(cfg.clips, spec, margin), num_envs, dt) if plays_clips(cfg.clips, spec) else None
         )

@@ -58,6 +58,9 @@ def arm_frames(spec: RobotSpec, arm: ArmSpec) -> ArmFrames:
         )
     _require_bent_at_zero(spec, arm, chain)
     tilt = 2.0 * np.arctan2(chain[0].quat[1], chain[0].quat[0])
+    rest = Rotation.from_quat(chain[0].quat, scalar_first=True) * Rotation.from_euler("X", -tilt)
+    if np.abs(rest.as_rotvec()[[0, 2]]).max() > _TURNED_RAD:  # a turn about y is one of the pitch joint
+        raise ValueError(f"{spec.name}: the {arm.side} shoulder must be tilted about x alone, got quat {chain[0].quat}")
     low, high = np.array([j.range_rad for j in joints]).T
     return ArmFrames(float(tilt), low, high)
 

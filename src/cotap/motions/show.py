@@ -18,18 +18,31 @@ from cotap.robots import RobotSpec
 _FRAMES_PER_CLIP = 8
 _LARGEST_SHEET = 24
 """Clips in a contact sheet; more are unreadable."""
+_LONGEST_NAME = 200
+"""Bytes of a picture's name, which file systems bound."""
 
 
 def draw(library: MotionLibrary, spec: RobotSpec, folder: Path) -> Iterator[Path]:
-    """Write a plot of each clip and a contact sheet of them; yields what was written."""
+    """Write a plot of each clip and a contact sheet of the first 24; yields what was written."""
     folder.mkdir(parents=True, exist_ok=True)
+    sheet = folder / "contact_sheet.png"
+    taken = {sheet}
     for clip in library.clips:
-        path = folder / f"{clip.name.replace('/', '_')}.png"
+        path = _free_path(folder, clip.name, taken)
+        taken.add(path)
         plot_clip(path, clip, spec)
         yield path
-    sheet = folder / "contact_sheet.png"
     _sheet(sheet, library.clips[:_LARGEST_SHEET], spec)
     yield sheet
+
+
+def _free_path(folder: Path, name: str, taken: set[Path]) -> Path:
+    """Of a picture, after the clip's name, and numbered if another has that."""
+    stem = name.replace("/", "_").encode()[:_LONGEST_NAME].decode(errors="ignore")
+    path, number = folder / f"{stem}.png", 2
+    while path in taken:
+        path, number = folder / f"{stem}_{number}.png", number + 1
+    return path
 
 
 def plot_clip(path: Path, clip: MotionClip, spec: RobotSpec) -> None:

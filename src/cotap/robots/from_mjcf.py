@@ -5,6 +5,7 @@ from __future__ import annotations
 # MuJoCo's extension module has no type stubs.
 # pyright: reportAttributeAccessIssue=false
 import json
+import math
 import re
 import sys
 from collections.abc import Callable
@@ -44,8 +45,8 @@ class FromMjcfOptions:
 def facts_of(path: Path | str, velocity_limit_rad_s: float = 20.0, source: str = "not stated") -> dict[str, Any]:
     """Bodies of a humanoid with their masses, inertias, colliding shapes and joints, and pairs that never collide.
 
-    Bodies without a joint become part of their parents, and meshes that collide boxes. Visual shapes and dry friction
-    of joints are left out.
+    Bodies without a joint become part of their parents, and meshes that collide boxes, at the mesh's own mass where
+    MuJoCo infers it. Visual shapes and dry friction of joints are left out.
 
     Raises:
         ValueError: the file or a mesh of it cannot be read, or the robot has what a `RobotSpec` cannot express.
@@ -82,9 +83,6 @@ def _compiled(path: Path | str) -> mujoco.MjModel:
     mj.compiler.fusestatic = True
     for sensor in list(mj.sensors):  # bodies that sensors name would be kept
         mj.delete(sensor)
-    for geom in mj.geoms:
-        if geom.type == mujoco.mjtGeom.mjGEOM_MESH and (geom.contype or geom.conaffinity):
-            geom.type = mujoco.mjtGeom.mjGEOM_BOX
     roots = [body for body in mj.worldbody.bodies if body.find_all("joint")]
     if len(roots) != 1:
         names = ", ".join(body.name for body in roots) or "none"
@@ -95,7 +93,27 @@ def _compiled(path: Path | str) -> mujoco.MjModel:
         exclude.bodyname1, exclude.bodyname2 = (_moved(mj.body(n)) for n in (exclude.bodyname1, exclude.bodyname2))
         if exclude.bodyname1 == exclude.bodyname2:
             mj.delete(exclude)
-    return _read(where, mj.compile)
+    weighed = _read(where, mj.compile)
+    _require_a_tree(where, weighed)
+    for geom in mj.geoms:
+        if geom.type == mujoco.mjtGeom.mjGEOM_MESH and (geom.contype or geom.conaffinity):
+            geom.type = mujoco.mjtGeom.mjGEOM_BOX
+    model = _read(where, mj.compile)
+    for inertial in ("body_mass", "body_ipos", "body_iquat", "body_inertia"):  # a box would weigh more than its mesh
+        getattr(model, inertial)[:] = getattr(weighed, inertial)
+    return model
+
+
+def _require_a_tree(where: str, model: mujoco.MjModel) -> None:
+    """Raise ValueError for what moves joints beside gravity, contacts and one motor each."""
+    other = {
+        "equality constraints": model.neq,
+        "tendons": model.ntendon,
+        "bodies with gravcomp": int((model.body_gravcomp != 0.0).sum()),
+    }
+    for what, number in other.items():
+        if number:
+            raise ValueError(f"{where}: {what} cannot be expressed, got {number}")
 
 
 def _require_file(where: str, path: Path | str) -> None:
@@ -164,19 +182,22 @@ def _joint(model: mujoco.MjModel, joint: int, mirror: tuple[str, float], velocit
 
 
 def _torque_limit(model: mujoco.MjModel, joint: int) -> float:
-    """The least that the joint itself and its actuator allow [Nm]."""
-    limits = [abs(model.jnt_actfrcrange[joint]).max()] if model.jnt_actfrclimited[joint] else []
+    """The least of what the joint itself and its actuators, which add up, allow [Nm]."""
+    own = abs(model.jnt_actfrcrange[joint]).max() if model.jnt_actfrclimited[joint] else math.inf
+    actuators: list[float] = []
     for a in range(model.nu):
         if model.actuator_trntype[a] != mujoco.mjtTrn.mjTRN_JOINT or model.actuator_trnid[a, 0] != joint:
             continue
-        gear = abs(model.actuator_gear[a, 0])
+        gear, limits = abs(model.actuator_gear[a, 0]), [math.inf]
         if model.actuator_forcelimited[a]:
             limits.append(gear * abs(model.actuator_forcerange[a]).max())
         if model.actuator_ctrllimited[a] and model.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_NONE:
             limits.append(gear * model.actuator_gainprm[a, 0] * abs(model.actuator_ctrlrange[a]).max())
-    if not limits:
+        actuators.append(min(limits))
+    limit = min(own, sum(actuators) if actuators else math.inf)
+    if limit == math.inf:
         raise ValueError(f"joint {model.joint(joint).name!r} needs a torque limit: give it an actuatorfrcrange")
-    return float(min(limits))
+    return float(limit)
 
 
 def _collides(model: mujoco.MjModel, geom: int) -> bool:

@@ -8,6 +8,7 @@ from itertools import zip_longest
 
 import numpy as np
 
+from cotap.checks import require_range
 from cotap.robots.kinematics import body_frame, default_angles
 
 Vec3 = tuple[float, float, float]
@@ -98,8 +99,9 @@ class RobotSpec:
     visits the bodies, depth first, so that `qpos[7:]` is joint by joint the same.
 
     Raises:
-        ValueError: joints are out of order, a name is unknown, mirrors or their defaults disagree, base and torso are
-            one body, or arms differ in length.
+        ValueError: joints are out of order, a name is unknown, a joint's number is out of its range, mirrors or their
+            defaults disagree, base and torso are one body, arms differ in length or do not lead to their hands, or arms
+            and feet are not a left and a right one.
     """
 
     name: str
@@ -171,12 +173,13 @@ class RobotSpec:
         return float(torso[0] - sum(self.sole(foot)[0] for foot in self.feet) / len(self.feet))
 
     def __post_init__(self) -> None:
+        self._check_sides()
+        for joint in self.joints:
+            self._check_numbers(joint)
         self._check_order()
         self._check_mirrors()
         self._check_bodies()
-        lengths = {arm.side: len(arm.joints) for arm in self.arms}
-        if len(set(lengths.values())) > 1:
-            raise ValueError(f"{self.name}: arms must have equally many joints, got {lengths}")
+        self._check_arms()
 
     def indices(self, names: tuple[str, ...] | list[str]) -> list[int]:
         """Positions of `names` among `joints`. Raises ValueError for an unknown name, listing all."""
@@ -211,6 +214,35 @@ class RobotSpec:
         """Centre of a sole (3,) in the base's frame in the default pose [m]."""
         position, rotation = body_frame(self, foot.body, self.base_body, default_angles(self))
         return position + rotation @ foot.sole
+
+    def _check_sides(self) -> None:
+        for what, parts in (("arms", self.arms), ("feet", self.feet)):
+            sides = tuple(part.side for part in parts)
+            if sides != ("left", "right"):
+                raise ValueError(f"{self.name}: {what} must be 'left' and 'right', in this order, got {sides}")
+
+    def _check_numbers(self, j: JointSpec) -> None:
+        where, most = f"{self.name}: joint {j.name!r}", 1e9
+        for name in ("torque_limit_nm", "velocity_limit_rad_s"):
+            require_range(f"{where}: {name}", getattr(j, name), 1e-6, most)
+        for name in ("kp", "kd", "armature_kg_m2", "damping_nms_rad"):
+            require_range(f"{where}: {name}", getattr(j, name), 0.0, most)
+        low, high = (require_range(f"{where}: range_rad", bound, -most, most) for bound in j.range_rad)
+        if not low < high:
+            raise ValueError(f"{where}: range_rad must begin below its end, got {j.range_rad}")
+        require_range(f"{where}: default_rad", j.default_rad, low, high)
+
+    def _check_arms(self) -> None:
+        lengths = {arm.side: len(arm.joints) for arm in self.arms}
+        if len(set(lengths.values())) > 1:
+            raise ValueError(f"{self.name}: arms must have equally many joints, got {lengths}")
+        for arm in self.arms:
+            joints = tuple(body.joint for body in self.chain(arm.hand_body, self.torso_body))
+            if joints != arm.joints:
+                raise ValueError(
+                    f"{self.name}: the {arm.side} arm's joints must be those from the torso to its hand, {joints}, got "
+                    f"{arm.joints}"
+                )
 
     def _check_order(self) -> None:
         if self.joint_names != self.lower_joints + self.upper_joints:
