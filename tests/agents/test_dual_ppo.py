@@ -11,6 +11,7 @@ import torch
 from dummy_env import TARGETS, TINY, DummyEnv
 from torch.distributions import Independent, Normal, kl_divergence
 
+from cotap.agents import dual_ppo
 from cotap.agents.actors import AgentLayout, Observations, as_dict
 from cotap.agents.dual_ppo import DualPPO, DualPPOConfig
 from cotap.agents.losses import LOWEST_RATE
@@ -229,6 +230,17 @@ def test_second_step_against_losses_written_with_torch_distributions():
         assert two.optimizers[name].param_groups[0]["lr"] == log[f"{name}/learning_rate"]
 
 
+def test_steps_become_smaller_with_the_samples(monkeypatch: pytest.MonkeyPatch):
+    """By hand: 50 samples an update, and the aim falls by half in 100."""
+    asked: list[float] = []
+    monkeypatch.setattr(dual_ppo, "adapt_learning_rate", lambda rate, _, aim: asked.append(aim) or rate)
+    learner = make_learner(num_envs=10, steps=5, epochs=1, mini_batches=1, desired_kl=0.02, kl_half_life=100.0)
+    for _ in range(3):
+        collect(learner)
+        learner.update()
+    assert asked == pytest.approx([0.02, 0.02, 0.02 * 0.5**0.5, 0.02 * 0.5**0.5, 0.01, 0.01])  # of two agents
+
+
 def test_every_sample_is_used_once_in_every_pass(monkeypatch: pytest.MonkeyPatch):
     learner = make_learner(epochs=3, mini_batches=4)
     collect(learner)
@@ -434,6 +446,7 @@ BAD = [
     ("learning_rate", NAN, "ppo.learning_rate must be a finite number, got nan"),
     ("learning_rate", -1e-3, "ppo.learning_rate must lie in .*, got -0.001"),
     ("desired_kl", 0.0, "ppo.desired_kl must lie in .*, got 0.0"),
+    ("kl_half_life", 0.0, "ppo.kl_half_life must lie in .*, got 0.0"),
     ("max_grad_norm", NAN, "ppo.max_grad_norm must be a finite number, got nan"),
     ("initial_std", 0.0, "ppo.initial_std must lie in .*, got 0.0"),
     ("precision", "fp16", "precision 'fp16' is unknown.*known: auto, bf16, fp32"),

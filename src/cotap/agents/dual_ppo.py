@@ -62,7 +62,9 @@ class DualPPOConfig:
     learning_rate: float = 1e-3
     """At the start; then adapted to `desired_kl`, per agent."""
     desired_kl: float = 0.01
-    """Change of the policy per update that the learning rate aims at [nat]."""
+    """Change of the policy per update that the learning rate aims at, at the start [nat]."""
+    kl_half_life: float = 74e6
+    """Samples in which that change falls by half: large steps first, later what gradients agree on."""
     max_grad_norm: float = 1.0
     """Gradient norm above which gradients are scaled down, per network."""
     precision: str = "auto"
@@ -86,7 +88,8 @@ class DualPPOConfig:
             require_range(f"ppo.{name}", getattr(self, name), 0.0, 1.0)
         for name in ("initial_std", "least_std", "clip", "learning_rate", "desired_kl", "max_grad_norm"):
             require_range(f"ppo.{name}", getattr(self, name), 1e-8, 1e6)
-        require_range("ppo.std_half_life", self.std_half_life, 1.0, 1e15)
+        for name in ("std_half_life", "kl_half_life"):
+            require_range(f"ppo.{name}", getattr(self, name), 1.0, 1e15)
         for name in ("entropy", "value", "value_clip"):
             require_range(f"ppo.{name}", getattr(self, name), 0.0, 1e3)
 
@@ -303,7 +306,8 @@ class DualPPO:
         own = [*model.actors[name].parameters(), log_std, *model.critics[name].parameters()]
         self._kl.grad = kl.reshape(1)  # travels with the gradients: one message instead of two
         self.ranks.average_gradients([*own, self._kl])
-        self.learning_rates[name] = adapt_learning_rate(self.learning_rates[name], float(self._kl.grad), cfg.desired_kl)
+        desired_kl = cfg.desired_kl * 0.5 ** (self.samples / cfg.kl_half_life)
+        self.learning_rates[name] = adapt_learning_rate(self.learning_rates[name], float(self._kl.grad), desired_kl)
         norm = nn.utils.clip_grad_norm_([*model.actors[name].parameters(), log_std], cfg.max_grad_norm)
         norm += nn.utils.clip_grad_norm_(model.critics[name].parameters(), cfg.max_grad_norm)
         if not torch.isfinite(norm):

@@ -115,7 +115,7 @@ def paper(robot: str = "h1") -> BaseTraining:
         ),
         ppo=DualPPOConfig(
             hidden=(512, 256, 128), initial_std=0.8, std_half_life=1e12, entropy=0.01, epochs=5, learning_rate=1e-4,
-            desired_kl=0.01, symmetric=False, upper_gamma=0.99,
+            desired_kl=0.01, kl_half_life=1e12, symmetric=False, upper_gamma=0.99,
         ),
         runner=RunnerConfig(iterations=20_000),
     )  # fmt: skip
