@@ -2,8 +2,8 @@
 
 `python examples/run_policy.py policy.onnx` runs it for a second on sensors that always say the same: a robot at rest
 in its default pose. A robot puts its own sensors and motors in their place, and calls `step` every `control_dt`.
-`--check` takes the readings that the file has with it through the loop, and compares the last observation and its
-targets with the file's.
+`--check` takes the readings that the file has with it through the loop, and compares its targets and last observation
+with the file's.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Command:
     velocity: tuple[float, float] = (0.0, 0.0)  # forward and leftward [m/s]
     yaw_rate: float = 0.0  # to the left [rad/s]
     stand: bool = True
-    height: float | None = None  # of the torso link above the ground, absolute [m]; None for the nominal height
+    height: float | None = None  # of the torso link above the ground [m], for robots that stand; None for nominal
 
 
 class PolicyRunner:
@@ -43,13 +43,16 @@ class PolicyRunner:
         path: What `cotap export` wrote, of a policy with PD arms.
         arm_reference: (U,) where the arms' reference begins [rad]; None for the default pose.
         phase: Where the gait begins, in [0, 1).
+        held: (J,) where the motors hold the joints before the first step [rad]; None for motors without torque.
     """
 
-    def __init__(self, path: str, arm_reference: np.ndarray | None = None, phase: float = 0.0) -> None:
+    def __init__(
+        self, path: str, arm_reference: np.ndarray | None = None, phase: float = 0.0, held: np.ndarray | None = None
+    ) -> None:
         self.session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
         self.meta = meta = {k: json.loads(v) for k, v in self.session.get_modelmeta().custom_metadata_map.items()}
         if any(meta["law"][side]["name"] != "pd" for side in ("left", "right")):
-            raise ValueError("this runner drives PD arms only")
+            raise ValueError("this runner drives PD arms only, and this policy's are under another law")
         arrays = ("default_pose_rad", "kp", "kd", "torque_limit_nm")
         self.default, self.kp, self.kd, self.limit = (np.array(meta[name]) for name in arrays)
         self.action_scale = np.array(meta["action"]["scale_rad"])
@@ -63,14 +66,15 @@ class PolicyRunner:
         (num_arms,) = (width for name, width, _ in meta["observation"]["terms"] if name == "reference_arm_position")
         self.reference = self.default[-num_arms:] if arm_reference is None else np.array(arm_reference)
         self.action = np.zeros(len(self.default))
-        self.targets: np.ndarray | None = None
+        self.targets = held
         self.observation = np.zeros(0, np.float32)
         self.history: list[dict[str, np.ndarray]] = []
 
     def step(self, sensors: Sensors, command: Command, arm_reference: np.ndarray) -> np.ndarray:
         """Joint targets (J,) [rad] for the coming control step, at whose end the arms are to be at `arm_reference`
-        (U,) [rad]."""
-        if self.targets is None:
+        (U,) [rad]. Raises ValueError for what is not finite: motors must then only damp, and the loop begin anew."""
+        _require_finite(**vars(sensors), velocity=command.velocity, reference=arm_reference)
+        if not self.history:
             self.stand = command.stand  # the robot begins at rest, and with what it is asked for
         else:
             self.follow(command)
@@ -79,6 +83,7 @@ class PolicyRunner:
         terms = [name for name, _, _ in self.meta["observation"]["terms"]]
         self.observation = np.concatenate([m[name] for name in terms for m in self.history]).astype(np.float32)
         (targets,) = self.session.run(None, {"observation": self.observation[None]})
+        _require_finite(targets=targets)
         self.action = (np.asarray(targets)[0] - self.offset(self.reference)) / self.action_scale
         self.reference = np.array(arm_reference)
         self.targets = sent = self.offset(self.reference) + self.action_scale * self.action
@@ -134,21 +139,27 @@ class PolicyRunner:
         return np.concatenate((self.default[: -len(reference)], reference))
 
 
+def _require_finite(**values: object) -> None:
+    for name, value in values.items():
+        if not np.isfinite(value).all():
+            raise ValueError(f"{name} must be finite, got {value}")
+
+
 def check(path: str) -> None:
-    """Compare the loop's last step with the one that the file has worked out; exit with 1 where they differ."""
+    """Compare the targets of every step, and the last observation, with the file's; exit with 1 where they differ."""
     runner = PolicyRunner(path)
     golden = runner.meta["golden"]
-    runner.phase, command = np.float32(golden["phase"]), Command(**golden["command"])
-    targets = np.zeros(0)
+    runner.phase, worst = np.float32(golden["phase"]), {"joint_targets": 0.0}
     for r in golden["readings"]:
         sensors = Sensors(*(np.array(r[name]) for name in ("joint_pos", "joint_vel", "angular_velocity", "gravity")))
-        targets = runner.step(sensors, command, np.array(r["arm_reference"]))
+        targets = runner.step(sensors, Command(**r["command"]), np.array(r["arm_reference"]))
+        worst["joint_targets"] = max(worst["joint_targets"], float(np.abs(targets - r["joint_targets"]).max()))
+    worst["observation"] = float(np.abs(runner.observation - golden["observation"]).max())
     # A gain of hundreds turns what rounding does to targets into torque that is observed.
-    for name, got, allowed in (("observation", runner.observation, 1e-4), ("joint_targets", targets, 1e-5)):
-        worst = float(np.abs(got - np.array(golden[name])).max())
-        print(f"{name}: differs from the file's by at most {worst:.1e}")
-        if not worst <= allowed:
-            sys.exit(1)
+    for name, difference in worst.items():
+        print(f"{name}: differs from the file's by at most {difference:.1e}")
+    if not (worst["observation"] <= 1e-4 and worst["joint_targets"] <= 1e-5):
+        sys.exit(1)
 
 
 def main(path: str) -> None:
@@ -162,10 +173,13 @@ def main(path: str) -> None:
 
 
 if __name__ == "__main__":
-    match sys.argv[1:]:
-        case ["--check", path]:
-            check(path)
-        case [path] if path != "--check":
-            main(path)
-        case _:
-            sys.exit(__doc__)
+    try:
+        match sys.argv[1:]:
+            case ["--check", path]:
+                check(path)
+            case [path] if path != "--check":
+                main(path)
+            case _:
+                sys.exit(__doc__)
+    except ValueError as error:
+        sys.exit(f"error: {error}")

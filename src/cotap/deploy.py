@@ -24,6 +24,8 @@ from cotap.evaluation.law_options import make_passive, parse_law
 from cotap.files import require_output
 from cotap.motions.reference import HELD
 
+_KEYBOARD_S = 600.0
+
 
 @dataclass
 class DeployOptions:
@@ -41,7 +43,7 @@ class DeployOptions:
     trials: int = 1
     """Number of trials, each with another seed."""
     episode_seconds: float | None = None
-    """Length of a trial [s]. By default 20; a scenario has its own."""
+    """Length of a trial [s]. By default 20, and 600 with --keyboard; a scenario has its own."""
     motion: str = HELD
     """Clip for the arms, `mixture` or `none`. mixture: clips and generated motion, as recipes have them. none:
     hold the default pose. A scenario has its own."""
@@ -114,16 +116,20 @@ def deploy(options: DeployOptions) -> dict[str, Any]:
         if text:
             setattr(laws, side, parse_law(side, text, replace(laws.of(side))))
             laws.modulation.hold()
+    for command in scenario.command:
+        for note in command.untrained(command_config(policy.metadata)):
+            print(f"note: {note}", file=sys.stderr)
     if options.passive:
         make_passive(laws)
     laws.check()
     pilot = KeyboardPilot(spec.nominal_height_m, command_config(policy.metadata)) if options.keyboard else None
     if pilot:
         scenario.command = (TimedCommand(stand=True),)
+        scenario.seconds = options.episode_seconds or _KEYBOARD_S
     started = time.perf_counter()
     with raw_terminal() if options.keyboard else nullcontext():
         if options.keyboard:
-            print(HELP)
+            print(f"{HELP}; it ends after {scenario.seconds:g} s")
         trials = run_trials(
             policy, laws, options.engine, options.perturbations, options.safety, scenario, options.trials, options.seed,
             pilot,

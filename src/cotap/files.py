@@ -78,6 +78,13 @@ def require_output(option: str, path: Path | str, suffixes: tuple[str, ...] = ()
     os.unlink(name)
 
 
+def require_folder(option: str, path: Path | str) -> None:
+    """Raise ValueError if `path` is no folder and cannot become one, since a file is in its way."""
+    first = next(place for place in (Path(path).absolute(), *Path(path).absolute().parents) if place.exists())
+    if not first.is_dir():
+        raise ValueError(f"{option} {str(path)!r} cannot be a folder: {str(first)!r} is a file")
+
+
 def _sync_folder(folder: Path) -> None:
     """Make a rename last through a power cut, where the system can."""
     with contextlib.suppress(OSError):  # Windows opens no folders, and some file systems sync none

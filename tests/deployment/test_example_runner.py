@@ -17,7 +17,9 @@ from cotap.deployment.controller import Controller, command_config, gait_config,
 from cotap.deployment.engines import EngineConfig, make_engine
 from cotap.deployment.policy import OnnxPolicy
 from cotap.deployment.robot import Perturbations, Robot
+from cotap.deployment.safety import SafetyConfig
 from cotap.deployment.scenario import TimedCommand
+from cotap.deployment.trial import start_up
 from cotap.envs.upper_body import UpperBodyConfig
 from cotap.motions.reference import ReferenceConfig, ReferenceMotion
 
@@ -50,12 +52,12 @@ def test_the_runner_is_the_packages_loop(robot, upper_mode, random_policy, examp
     motion = ReferenceMotion(ReferenceConfig(), spec, 1, meta.control_dt)
     controller = Controller(policy, spec, UpperBodyConfig(), command_config(meta), motion, seed=3)
     give(controller, ASKED[0])
-    controller.restart()
-    runner = example.PolicyRunner(str(path), controller.initial_arms, float(controller.commands.gait.phase))
     machine = Robot(make_engine(ENGINE, spec), ENGINE, spec, meta.control_dt, Perturbations())
+    start_up(machine, controller, SafetyConfig(), seed=0)  # after which joints sag, and motors have torque
     pose = np.array([j.default_rad for j in spec.joints])
     pose[-len(controller.initial_arms) :] = controller.initial_arms
-    machine.start(pose, seed=0)
+    runner = example.PolicyRunner(str(path), controller.initial_arms, float(controller.commands.gait.phase), pose)
+    assert np.abs(machine.torque()).max() > 0.5
     machine.engine.hold(True)
     moved, rested = 0.0, False
     for k in range(150):
@@ -80,6 +82,19 @@ def test_the_runner_is_the_packages_loop(robot, upper_mode, random_policy, examp
     assert rested  # and walked before and after
     assert not controller.commands.current().stand[0]
     assert moved > 0.1
+
+
+def test_what_is_not_finite_ends_the_loop(policy_file, example):
+    runner = example.PolicyRunner(str(policy_file))
+    still = np.zeros_like(runner.default)
+    down = np.array([0.0, 0.0, -1.0])
+    runner.step(example.Sensors(runner.default, still, np.zeros(3), down), example.Command(), runner.reference)
+    for name in ("joint_pos", "joint_vel", "angular_velocity", "gravity"):
+        sensors = example.Sensors(runner.default.copy(), still.copy(), np.zeros(3), down.copy())
+        getattr(sensors, name)[0] = np.nan
+        with pytest.raises(ValueError, match=f"{name} must be finite"):
+            runner.step(sensors, example.Command(), runner.reference)
+    assert np.isfinite(runner.action).all()
 
 
 def give(controller: Controller, asked: TimedCommand) -> None:
@@ -118,6 +133,12 @@ FAULTS = {
     "gait half as fast": ('self.dt / self.meta["gait"]', '0.5 * self.dt / self.meta["gait"]'),
     "torque without damping": (" - self.kd * s.joint_vel", ""),
     "reference of the step before": ("self.reference = np.array(arm_reference)", "self.reference = self.reference"),
+    "never at rest": ("bool(to_stand and", "bool(0 and to_stand and"),
+    "at rest without a stride on the spot": ("self.on_the_spot > 1.0", "self.on_the_spot > -1.0"),
+    "no flag": ("float(self.stand)", "0.0"),
+    "a phase at rest": ("0.0 if self.stand else np.cos(angle)", "np.cos(angle)"),
+    "height at once": ("np.clip(asked_height - self.height, -rate, rate)", "asked_height - self.height"),
+    "height ignored": ("nominal if command.height is None else", "nominal if True else"),
 }  # fmt: skip
 
 
@@ -140,6 +161,10 @@ def test_it_refuses_arms_under_another_law(policy_file, example, tmp_path):
     onnx.save(proto, tmp_path / "p.onnx")
     with pytest.raises(ValueError, match="PD arms only"):
         example.PolicyRunner(str(tmp_path / "p.onnx"))
+    done = subprocess.run([sys.executable, str(EXAMPLE), str(tmp_path / "p.onnx")], capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: this runner drives PD arms only")
+    assert done.stderr.count("\n") == 1
 
 
 @pytest.mark.parametrize("arguments", [[], ["--check"], ["a.onnx", "b.onnx"]])

@@ -239,6 +239,22 @@ def test_paused_it_stands_still_but_for_single_steps_and_reset_starts_over(app):
     assert int(app.session.env.episode_length_buf[0]) == 0
 
 
+def test_a_recording_that_cannot_be_written_is_tried_again(app, monkeypatch, capsys):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    keep = app.archive.keep
+    monkeypatch.setattr(app.archive, "keep", full)
+    for asked in (True, False):
+        app.mailbox.ask(Record(asked))
+        app.advance()
+    assert "not recorded: " in capsys.readouterr().err
+    monkeypatch.setattr(app.archive, "keep", keep)
+    monkeypatch.setattr(app, "_draw_until_stopped", lambda: None)
+    app.run()
+    assert len(load_recording(app.archive.path).trajectory.fell) >= 1
+
+
 def test_a_recording_holds_what_was_shown_and_a_change_of_robots_ends_it(app):
     app.mailbox.ask(Record(True))
     for step in range(30):

@@ -1,4 +1,4 @@
-"""A few steps of the loop worked out, for users to check a loop of their own against."""
+"""A walk that comes to rest, worked out step by step, for users to check a loop of their own against."""
 
 from __future__ import annotations
 
@@ -15,12 +15,15 @@ from cotap.envs.modulation import OBSERVED_STIFFNESS
 from cotap.envs.observations import ObservationHistory, Term, actor_values
 from cotap.robots import RobotSpec
 
-STEPS = 8
-"""More than a history has, so that none of it is of the first step."""
-PHASE = 0.2
-"""Of the gait at the start."""
+WALKING = 8
+"""Steps in which the robot is asked to walk. It then stands, which takes the rest of a stride, and then squats."""
+RESTED = 4
+"""Steps at rest: the height is then still on its way."""
+PHASE = 0.9
+"""Of the gait at the start, so that it begins anew on the way."""
 VELOCITY, YAW_RATE = (0.4, -0.2), 0.3
-"""What is asked for [m/s], [rad/s]; commands are still on their way there at the end."""
+"""What is asked for at first [m/s], [rad/s]."""
+SQUAT_M = 0.1
 
 Targets = Callable[[torch.Tensor], torch.Tensor]
 
@@ -29,11 +32,13 @@ def golden_steps(
     cfg: HumanoidEnvConfig, spec: RobotSpec, terms: tuple[Term, ...], history: int, targets: Targets, offset: Targets,
     scale: torch.Tensor, seed: int,
 ) -> tuple[dict[str, Any], torch.Tensor]:  # fmt: skip
-    """Made-up readings of a robot that is asked to walk, and the last observation (W,) that they lead to.
+    """Made-up readings of a robot that is asked to walk, to stand and to squat, and the last observation (W,) that they
+    lead to.
 
-    Each of the readings has `joint_pos` and `joint_vel` (J,), `angular_velocity` and `gravity` (3,) of the torso, and
-    `arm_reference` (U,), where the arms are to be at the step's end. What follows from a law and not from the loop is
-    among them under its term's name: torques of arms that are not under PD, and what modulated laws are set to.
+    Each of the readings has the `command`, `joint_pos` and `joint_vel` (J,), `angular_velocity` and `gravity` (3,) of
+    the torso, and `arm_reference` (U,), where the arms are to be at the step's end; and `joint_targets` (J,), where the
+    loop sends the joints. What follows from a law and not from the loop is among them under its term's name: torques of
+    arms that are not under PD, and what modulated laws are set to.
 
     Args:
         cfg: The policy's environment.
@@ -53,22 +58,23 @@ def golden_steps(
     )
     limit = cfg.torque_limit_scale * limit
     commands = CommandSource(cfg.commands, cfg.gait, 1, spec.nominal_height_m, cfg.control_dt)
-    commands.override(
-        torch.tensor([VELOCITY]), torch.tensor([YAW_RATE]), torch.zeros(1), torch.tensor([spec.nominal_height_m])
-    )
+    _ask(commands, asked := _asked(0, 0, spec))
     commands.reset(torch.ones(1, dtype=torch.bool), rng)
     commands.gait.phase[:] = PHASE
     buffer = ObservationHistory(terms, 1, history)
     reference, action, sent, readings = default[:, arms], torch.zeros_like(default), default, []
-    observation = torch.zeros(0)
-    for k in range(STEPS):
-        made_up = _reading(cfg, spec, rng)
-        if k == STEPS - 1:  # so that what is sent is what the network said
+    observation, rested = torch.zeros(0), 0
+    while rested < RESTED:
+        k = len(readings)
+        if k > 0:
+            _ask(commands, asked := _asked(k, rested, spec))
+            commands.step(rng)
+            rested += int(commands.current().stand[0])
+        made_up = {"command": asked} | _reading(cfg, spec, rng)
+        if rested == RESTED:  # so that what is sent is what the network said
             made_up["arm_reference"] = readings[-1]["arm_reference"]
         q, dq = (torch.tensor([made_up[name]], dtype=torch.float64) for name in ("joint_pos", "joint_vel"))
         torque = (kp * (sent - q) - kd * dq).clamp(-limit, limit)[:, arms] * (k > 0)
-        if k > 0:
-            commands.step(rng)
         turn, down = (torch.tensor([made_up[name]], dtype=torch.float64) for name in ("angular_velocity", "gravity"))
         # Of the state, actors observe this alone.
         state: Any = SimpleNamespace(torso_angular_velocity_t=turn, projected_gravity_t=down, joint_pos=q, joint_vel=dq)
@@ -79,12 +85,29 @@ def golden_steps(
         action = (targets(observation).double() - offset(reference)) / scale
         reference = torch.tensor([made_up["arm_reference"]], dtype=torch.float64)
         sent = offset(reference) + scale * action
-        readings.append(made_up)
-    asked = {"velocity": list(VELOCITY), "yaw_rate": YAW_RATE, "stand": False, "height": spec.nominal_height_m}
-    return {"command": asked, "phase": PHASE, "readings": readings}, observation[0]
+        readings.append(made_up | {"joint_targets": [round(target, 7) for target in sent[0].tolist()]})
+    return {"phase": PHASE, "readings": readings}, observation[0]
 
 
-def _reading(cfg: HumanoidEnvConfig, spec: RobotSpec, rng: torch.Generator) -> dict[str, list[float]]:
+def _asked(step: int, rested: int, spec: RobotSpec) -> dict[str, Any]:
+    """The command of a step, after so many steps at rest."""
+    walks, height = step < WALKING, spec.nominal_height_m
+    return {
+        "velocity": list(VELOCITY) if walks else [0.0, 0.0],
+        "yaw_rate": YAW_RATE if walks else 0.0,
+        "stand": not walks,
+        "height": height - SQUAT_M if rested else height,
+    }
+
+
+def _ask(commands: CommandSource, asked: dict[str, Any]) -> None:
+    stand = torch.tensor([float(asked["stand"])])
+    commands.override(
+        torch.tensor([asked["velocity"]]), torch.tensor([asked["yaw_rate"]]), stand, torch.tensor([asked["height"]])
+    )
+
+
+def _reading(cfg: HumanoidEnvConfig, spec: RobotSpec, rng: torch.Generator) -> dict[str, Any]:
     """One step's readings, each a little off what it is at rest."""
 
     def near(values: list[float], width: float) -> list[float]:

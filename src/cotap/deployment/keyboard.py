@@ -25,7 +25,7 @@ class Stick:
     def __init__(self, trained: CommandConfig) -> None:
         self._limits = {
             "forward": trained.velocity_x, "leftward": trained.velocity_y, "yaw_rate": trained.yaw_rate,
-            "height_offset": (trained.height_offset[0], 0.0),
+            "height_offset": trained.height_offset,
         }  # fmt: skip
         self._value = dict.fromkeys(self._limits, 0.0)
         self.ended = False

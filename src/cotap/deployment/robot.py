@@ -33,7 +33,7 @@ class Perturbations:
     velocity_noise: float = 0.0
     """Most noise on joint velocities, uniform [rad/s]."""
     mass_error: float = 0.0
-    """Largest share by which all masses are off."""
+    """Share by which all masses are off, up or down."""
     start_error: float = 0.0
     """Largest error of the first pose [rad]. Of joints, and of the base about x and y."""
 

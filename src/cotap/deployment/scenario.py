@@ -12,7 +12,7 @@ import torch
 from cotap.checks import legible, quoted, require_finite, require_range
 from cotap.compliance.laws import LawConfig
 from cotap.configs import from_plain
-from cotap.envs.commands import CommandSource
+from cotap.envs.commands import CommandConfig, CommandSource
 from cotap.envs.scripted_forces import ForceProfile, ScriptedForces
 from cotap.evaluation.law_options import parse_law
 from cotap.inputs import InputError, read_text
@@ -50,13 +50,27 @@ class TimedCommand:
         for i, value in enumerate(self.velocity):
             require_range(f"{where}.velocity[{i}]", value, -5.0, 5.0)
         require_range(f"{where}.yaw_rate", self.yaw_rate, -5.0, 5.0)
-        require_range(f"{where}.height_offset", self.height_offset, -0.5, 0.0)
+        require_range(f"{where}.height_offset", self.height_offset, -0.5, 0.5)
         if not isinstance(self.stand, bool):
             raise ValueError(f"{where}.stand must be true or false, got {quoted(self.stand)}")
         if self.stand and (any(self.velocity) or self.yaw_rate):
             raise ValueError(f"{where} stands and moves: velocity {self.velocity}, yaw_rate {self.yaw_rate}")
         if self.height_offset and not self.stand:
             raise ValueError(f"{where}.height_offset must be 0 where stand is false, got {self.height_offset}")
+
+    def untrained(self, trained: CommandConfig) -> list[str]:
+        """Which values are beyond the ranges of training."""
+        ranges = {
+            "forward velocity": (self.velocity[0], trained.velocity_x),
+            "leftward velocity": (self.velocity[1], trained.velocity_y),
+            "yaw rate": (self.yaw_rate, trained.yaw_rate),
+            "height offset": (self.height_offset, trained.height_offset),
+        }
+        return [
+            f"{name} {value:g} at {self.at:g} s is beyond training's {low:g} to {high:g}"
+            for name, (value, (low, high)) in ranges.items()
+            if not low <= value <= high
+        ]
 
     def give(self, commands: CommandSource, nominal_height_m: float) -> None:
         """Hand this command over."""

@@ -32,7 +32,7 @@ def about_terms(cfg: HumanoidEnvConfig, spec: RobotSpec, terms: tuple[Term, ...]
         "command_velocity": ("commanded velocity, forward and leftward, heading frame", "m/s", velocity),
         "command_yaw_rate": ("commanded turning rate, positive to the left", "rad/s", list(c.yaw_rate)),
         "command_stand": ("1 stands, 0 walks", "1", [0.0, 1.0]),
-        "command_height": ("commanded height of the torso link's origin above the ground, absolute", "m", height),
+        "command_height": ("torso link's origin above the ground; nominal while walking", "m", height),
         "reference_arm_position": ("angles that the arms are to have, absolute", "rad", [low, high]),
         "joint_position": ("joint angles minus the default pose", "rad", moved),
         "joint_velocity": ("joint rates", "rad/s", [[-v for v in speeds], speeds]),

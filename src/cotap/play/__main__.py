@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import tyro
 
 from cotap.checks import require_one_of, shortened
+from cotap.files import require_folder
 from cotap.play import ROBOTS
 from cotap.play.startup import uncollected
 
@@ -123,6 +124,7 @@ def _live(options: PlayOptions, first: str = "") -> Callable[[ViserServer], App]
     """
     from cotap.robots import ROBOTS as KNOWN_ROBOTS
 
+    require_folder("output", options.output)
     robot = _first_robot(options)
     require_one_of("robot", robot, KNOWN_ROBOTS)
     spec = KNOWN_ROBOTS[robot]()

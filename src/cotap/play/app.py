@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 import viser
 
+from cotap.evaluation.recording import Recording
 from cotap.play import ROBOTS
 from cotap.play.archive import Archive
 from cotap.play.controls import Choice, Refused
@@ -63,6 +65,7 @@ class App:
         self._robot = Choice("robot", robots or (robot,), robot)
         self._failure: BaseException | None = None
         self._recorder: Recorder | None = None
+        self._unwritten: list[Recording] = []
         self._changes: dict[str, Any] = {}
         self._noticed: set[str] = set()
         self._latest: tuple[int, Sample] | None = None
@@ -310,15 +313,18 @@ class App:
             self._changes.clear()  # they are in what describes the recording
 
     def _keep_recording(self) -> None:
-        """End the recording, if there is one, and write it."""
+        """End the recording, if there is one, and write it. What cannot be written is tried again with the next, and at
+        the end."""
         recorder, self._recorder = self._recorder, None
-        if recorder is None:
-            return
         try:
-            path = self.archive.keep(recorder.finish())
+            if recorder is not None:
+                self._unwritten.append(recorder.finish())
+            while self._unwritten:
+                path = self.archive.keep(self._unwritten[0])
+                kept = self._unwritten.pop(0)
+                text = f"{len(kept.trajectory.fell) * self.session.dt:.1f} s written to {path}"
+                print(text, flush=True)  # the page may be closed, or about to be
+                self.notices.tell(text, title="recorded")
         except (OSError, ValueError) as error:
+            print(f"not recorded: {error}", file=sys.stderr, flush=True)
             self.notices.tell(str(error), title="not recorded")
-        else:
-            text = f"{recorder.seconds:.1f} s written to {path}"
-            print(text, flush=True)  # the page may be closed, or about to be
-            self.notices.tell(text, title="recorded")
