@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import sys
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import onnxruntime
@@ -139,7 +140,7 @@ class PolicyRunner:
         return np.concatenate((self.default[: -len(reference)], reference))
 
 
-def _require_finite(**values: object) -> None:
+def _require_finite(**values: Any) -> None:
     for name, value in values.items():
         if not np.isfinite(value).all():
             raise ValueError(f"{name} must be finite, got {value}")
