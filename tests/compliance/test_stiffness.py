@@ -250,7 +250,7 @@ def test_without_a_direction_to_move_in_it_is_pd(joints: int, smallest: float, r
 
 
 @pytest.mark.parametrize("cond", [10.0, 1e2, 1e3, 1e4, 1e5, 3e5])
-@pytest.mark.parametrize(("apart", "rtol"), [(15.0, 2e-3), (100.0, 5e-3), (300.0, 0.1)])
+@pytest.mark.parametrize(("apart", "rtol"), [(15.0, 4e-3), (100.0, 1e-2), (300.0, 0.1)])
 def test_directions_of_very_different_stiffness_near_a_singularity(apart: float, rtol: float, cond: float, rng):
     """What the blend asks for lies between what compliance and PD do: rounding leaves it positive."""
     u, s, v = torch.linalg.svd(torch.randn(2000, 3, 4, dtype=DOUBLE, generator=rng), full_matrices=False)
