@@ -108,7 +108,7 @@ def load_clips(cfg: ClipConfig, spec: RobotSpec, margin_rad: float = 0.0) -> Mot
     if not names:
         raise MotionError("clips.held_out leaves no clip to play")
     limit = np.array([j.velocity_limit_rad_s for j in spec.upper_joint_specs])
-    limits = torch.tensor([j.range_rad for j in spec.upper_joint_specs]).unbind(1)
+    limits = torch.tensor([j.range_rad for j in spec.upper_joint_specs], device="cpu").unbind(1)
     low, high = (bound.numpy() for bound in within_limits(limits[0], limits[1], margin_rad))
     clips = (replace(clip, arms=clip.arms.clip(low, high)) for clip in library.select(names, spec).clips)
     return MotionLibrary([pace(clip, cfg.velocity_share * limit, cfg.acceleration) for clip in clips], spec)
