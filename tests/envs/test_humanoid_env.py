@@ -226,6 +226,25 @@ def test_a_restarted_env_owes_nothing_to_its_past(make_env, robot):
     assert env.recorder.mean_error[0].any()
 
 
+def test_critics_see_the_same_wherever_north_is(make_env, robot):
+    """Turned about the vertical, with the same forces in the heading frame, a robot looks the same to its critic."""
+    loads = HandLoadConfig(enabled=True, episode_share=1.0, zero_probability=0.0)
+    env = make_env(2, robot=robot, forces=ExternalForceConfig(hand_loads=loads), randomization=NOMINAL)
+    drive(env, 3)
+    s, force_w = env.state, env.hand_force_w
+    turn = torch.tensor([[0.6, -0.8, 0.0], [0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])
+    turned = dataclasses.replace(s, torso_rotation_w=turn @ s.torso_rotation_w, heading_w=turn @ s.heading_w)
+    seen = []
+    for env.state, env.forces.hand_force_w in ((s, force_w), (turned, force_w @ turn.T)):
+        observed = env._observe(torch.zeros(2, dtype=torch.bool))
+        seen.append(privileged(env, observed["privileged"]))
+    assert force_w.norm(dim=2).min() > 1.0
+    by_hand = torch.einsum("nwh,naw->nah", s.heading_w, force_w).flatten(1)
+    torch.testing.assert_close(seen[0]["hand_force"], by_hand, atol=1e-4, rtol=1e-5)
+    for name, value in seen[0].items():
+        torch.testing.assert_close(seen[1][name], value, atol=1e-4, rtol=1e-5)
+
+
 @pytest.mark.usefixtures("in_tmp_path")
 @pytest.mark.parametrize("field", ["qpos", "qvel"])
 @pytest.mark.parametrize("value", [math.nan, math.inf])

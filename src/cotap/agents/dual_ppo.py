@@ -63,7 +63,7 @@ class DualPPOConfig:
     """At the start; then adapted to `desired_kl`, per agent."""
     desired_kl: float = 0.01
     """Change of the policy per update that the learning rate aims at, at the start [nat]."""
-    kl_half_life: float = 74e6
+    kl_half_life: float = 150e6
     """Samples in which that change falls by half: large steps first, later what gradients agree on."""
     max_grad_norm: float = 1.0
     """Gradient norm above which gradients are scaled down, per network."""

@@ -70,15 +70,14 @@ def default(robot: str = "h1") -> BaseTraining:
             assist=AssistConfig(enabled=True),
             curriculum=CurriculumConfig(arm_motion_samples=3e6),
             forces=ExternalForceConfig(
-                hand_loads=HandLoadConfig(enabled=True, ramp=RampConfig(16e6, 60e6, first=0.1)),
+                hand_loads=HandLoadConfig(enabled=True, episode_share=0.8, ramp=RampConfig(16e6, 60e6, first=0.1)),
                 pushes=PushConfig(enabled=True, velocity=(0.0, 1.2), ramp=RampConfig(20e6, 80e6, first=0.3)),
             ),
         ),
         runner=RunnerConfig(iterations=12_207),
     )
-    if robot == "g1":  # three joints in the waist; it learned to walk where few hands were loaded
+    if robot == "g1":  # three joints in the waist
         training.env.actions.waist_share = 0.5
-        training.env.forces.hand_loads.episode_share = 0.2
     return training
 
 

@@ -104,10 +104,10 @@ class Observer(Stateful):
             rng: Of sensor noise.
         """
         present = self._present(s, command, arm_reference, torque, goals)
-        privileged = [quat_from_matrix(s.torso_rotation_w), s.torso_linear_velocity_h]
+        privileged = [quat_from_matrix(s.torso_to_heading), s.torso_linear_velocity_h]
         if self.cfg.arm_torque != "actor":
             privileged.append(torque[:, -self._upper :])
-        privileged.append(hand_force_w.flatten(1))
+        privileged.append((hand_force_w @ s.heading_w).flatten(1))
         groups: dict[str, torch.Tensor] = {}
         if self.cfg.critic == "present":
             groups["present"] = present
