@@ -27,6 +27,23 @@ TRAININGS: dict[str, list[str]] = {
 """By the policy's name in `reports.reproduce_paper`."""
 
 
+def train_all(names: list[str], run_dir: Path, options: list[str]) -> dict[str, Path]:
+    """Train those of `names`, one after another. Returns the last checkpoint of each.
+
+    Raises:
+        Stopped: it was asked to stop before.
+        ValueError: an option of `cotap train distill` is not valid, or two began from different bases.
+    """
+    last: dict[str, Path] = {}
+    bases: set[str] = set()
+    for name in names:
+        last[name] = train(name, run_dir, options)
+        bases.add(load_checkpoint(last[name])["config"]["base"]["sha256"])
+        if len(bases) > 1:
+            raise ValueError(f"{run_dir / name} began from another base than {run_dir / names[0]}")
+    return last
+
+
 def train(name: str, run_dir: Path, options: list[str]) -> Path:
     """Train one of them to its end, from its newest checkpoint if there is one. Returns its last.
 
@@ -59,7 +76,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         for name in own.only:
             require_one_of("--only", name, TRAININGS.keys())
-        last = {name: train(name, own.run_dir, options) for name in own.only}
+        last = train_all(own.only, own.run_dir, options)
     except (ValueError, OSError) as error:
         print(f"error: {shortened(str(error))}", file=sys.stderr)
         return 2

@@ -23,7 +23,8 @@ def asked(monkeypatch) -> list[list[str]]:
         folder.mkdir(parents=True, exist_ok=True)
         iterations = int(args[args.index("--iterations") + 1])
         training = {"runner": {"iterations": iterations}}
-        content = {"iteration": 3, "config": {"training": training}, "layout": {"robot": "g1"}}
+        base = {"sha256": args[args.index("--base-checkpoint") + 1] if "--base-checkpoint" in args else "shipped"}
+        content = {"iteration": 3, "config": {"training": training, "base": base}, "layout": {"robot": "g1"}}
         save_checkpoint(folder / "checkpoint_000003.pt", content)
 
     monkeypatch.setattr(train_ablations, "run_stage", run_stage)
@@ -60,6 +61,22 @@ def test_the_tables_have_the_base_that_all_began_from(asked, tmp_path, capsys):
     assert main(["--run-dir", str(tmp_path), "--iterations", "3", "--base-checkpoint", "b.pt", "--only", "goals"]) == 0
     assert asked[0][asked[0].index("--base-checkpoint") + 1] == "b.pt"
     assert f"--policies base=b.pt goals={tmp_path}/goals/" in capsys.readouterr().out
+
+
+def test_those_of_different_bases_are_not_compared(asked, tmp_path, capsys, monkeypatch):
+    """As where the shipped base was replaced between two of them."""
+    said = ["--run-dir", str(tmp_path), "--iterations", "3", "--only", "goals", "facet", "seed-0"]
+    sha = iter(["old", "new"])
+    train_one = train_ablations.run_stage
+
+    def run_stage(stage: str, args: list[str]) -> None:
+        train_one(stage, [*args, "--base-checkpoint", next(sha)])
+
+    monkeypatch.setattr(train_ablations, "run_stage", run_stage)
+    assert main(said) == 2
+    assert len(asked) == 2
+    error = capsys.readouterr().err
+    assert f"{tmp_path}/facet began from another base than {tmp_path}/goals" in error
 
 
 def test_one_that_is_stopped_ends_it(asked, tmp_path, capsys):

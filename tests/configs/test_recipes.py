@@ -278,6 +278,14 @@ def test_recipes_ask_for_as_many_samples_whatever_the_number_of_envs(names: list
         assert asked == pytest.approx(samples, rel=2e-3)
 
 
+@pytest.mark.parametrize("name", ["default", "quick", "short", "no-ratio", "facet", "modulated"])
+def test_updates_shrink_to_a_quarter_over_a_distillation_as_over_a_base(name: str):
+    base = BASE_RECIPES["default"]()
+    for training in (base, DISTILL_RECIPES[name](base)):
+        assert training.samples / training.ppo.kl_half_life == pytest.approx(2.0, rel=2e-3)
+        assert training.ppo.desired_kl == 0.01
+
+
 def test_facet_is_trained_on_unmoved_references_and_otherwise_as_cotap():
     """Appendix D: its own reward in the place of key points; no law moves the reference in training."""
     base = BASE_RECIPES["default"]()
@@ -286,6 +294,7 @@ def test_facet_is_trained_on_unmoved_references_and_otherwise_as_cotap():
     assert facet.env.upper_body.left.name == facet.env.upper_body.right.name == "pd"
     weights = cotap.env.rewards.upper
     changed = {"track_key_points": 0.0, "track_key_velocities": 0.0, "track_hands_as_facet": 1.3}
+    changed["reference_closeness"] = 0.0
     assert to_plain(facet.env.rewards.upper) == to_plain(weights) | changed
     assert weights.track_arms == 2.0
     assert weights.reference_closeness == 1.0

@@ -46,14 +46,20 @@ def default(base: BaseTraining) -> DistillTraining:
     env.rewards.upper.reference_closeness = 1.0
     if env.actions.upper_mode == "residual":
         training.distillation.anew = ("upper",)  # under PD it has learned to resist loads
-    training.train_for(150e6)
+    _for(training, 150e6)
     return training
+
+
+def _for(training: DistillTraining, samples: float) -> None:
+    """So many samples, over which the change that updates aim at falls to a quarter, as it does over a base's."""
+    training.train_for(samples)
+    training.ppo.kl_half_life = samples / 2.0
 
 
 def quick(base: BaseTraining) -> DistillTraining:
     """The beginnings of compliance in the shortest time; 15 M samples."""
     training = default(base)
-    training.train_for(15e6)
+    _for(training, 15e6)
     return training
 
 
@@ -67,6 +73,7 @@ def paper(base: BaseTraining) -> DistillTraining:
     training.env.forces.pushes.enabled = False
     training.distillation.anew = ()
     training.train_for(20_000 * training.ppo.steps * 4096)
+    training.ppo.kl_half_life = base.ppo.kl_half_life
     return training
 
 
@@ -85,7 +92,7 @@ def _after_base(training: DistillTraining, base: BaseTraining) -> None:
 def short(base: BaseTraining) -> DistillTraining:
     """What ablations change one part of and are compared with: `default`, 40 M samples."""
     training = default(base)
-    training.train_for(40e6)
+    _for(training, 40e6)
     return training
 
 
@@ -117,6 +124,7 @@ def facet(base: BaseTraining) -> DistillTraining:
     training = short(base)
     training.env.upper_body = UpperBodyConfig()
     training.distillation.anew = ()
+    training.env.rewards.upper.reference_closeness = 0.0  # which is CoTaP's
     track_as_facet(training.env.rewards.upper)
     return training
 
@@ -134,7 +142,7 @@ def modulated(base: BaseTraining) -> DistillTraining:
     training.distillation.anew = ()
     training.distillation.new_std = 1.0  # of what is asked of the laws, whose rates smooth it
     training.ppo.upper_gamma = 0.97  # a hand that gave way takes half a second to return
-    training.train_for(60e6)
+    _for(training, 60e6)
     return training
 
 
