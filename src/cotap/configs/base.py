@@ -71,7 +71,14 @@ def default(robot: str = "h1") -> BaseTraining:
             curriculum=CurriculumConfig(arm_motion_samples=3e6),
             forces=ExternalForceConfig(
                 hand_loads=HandLoadConfig(enabled=True, episode_share=0.8, ramp=RampConfig(16e6, 60e6, first=0.1)),
-                pushes=PushConfig(enabled=True, velocity=(0.0, 1.2), ramp=RampConfig(20e6, 80e6, first=0.3)),
+                pushes=PushConfig(
+                    enabled=True,
+                    velocity=(0.3, 1.2),
+                    hand_share=0.25,
+                    link_share=0.5,
+                    largest_pitch=1.0,
+                    ramp=RampConfig(20e6, 80e6, first=0.3),
+                ),
             ),
         ),
         runner=RunnerConfig(iterations=12_207),

@@ -39,7 +39,7 @@ def default(base: BaseTraining) -> DistillTraining:
     )
     _after_base(training, base)
     pushes = env.forces.pushes
-    pushes.hand_share = 0.5  # hands are what the law is for
+    pushes.hand_share, pushes.link_share = 0.5, 0.3  # hands are what the law is for
     pushes.velocity, pushes.largest_pitch = (0.0, 1.5), 0.5 * math.pi
     env.path.share = 0.1
     # At 0.1 the agent brought arms 2 % closer, and resisted small loads: hands felt stiffer by up to a quarter.
