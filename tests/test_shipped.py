@@ -32,6 +32,8 @@ def test_a_shipped_policy_is_small_and_says_where_it_comes_from(name: str):
     assert said["seed"] == content["config"]["training"]["seed"]
     assert said["command"].startswith(("cotap train", "python -m cotap.train"))
     assert said["commit"]
+    commands = [said["command"], *(run["command"] for run in said["runs"])]
+    assert not [word for command in commands for word in command.split() if word.startswith("/")]  # one machine's paths
     assert said["evaluations"].keys() == EVALUATIONS.keys()
 
 
