@@ -286,6 +286,11 @@ def test_updates_shrink_to_a_quarter_over_a_distillation_as_over_a_base(name: st
         assert training.ppo.desired_kl == 0.01
 
 
+def test_the_papers_updates_do_not_shrink():
+    base = BASE_RECIPES["paper"]()
+    assert DISTILL_RECIPES["paper"](base).ppo.kl_half_life == base.ppo.kl_half_life == 1e12
+
+
 def test_facet_is_trained_on_unmoved_references_and_otherwise_as_cotap():
     """Appendix D: its own reward in the place of key points; no law moves the reference in training."""
     base = BASE_RECIPES["default"]()

@@ -88,8 +88,8 @@ def actor_terms(
 
 
 def critic_terms(num_hands: int, num_torques: int = 0, num_feet: int = 0) -> tuple[Term, ...]:
-    """Terms that only the critic sees, for the present step, in the heading frame: what the rewards do not depend on,
-    where north is, the critic need not learn to ignore. `num_torques` arm torques that the actor does not see.
+    """Terms that only the critic sees, for the present step, in the heading frame: rewards do not depend on where a
+    robot faces. `num_torques` arm torques that the actor does not see.
 
     With `num_feet`, also what rewards are made of and what is about to happen to the robot. A critic that is surprised
     by a push blames the actions before it (Mao et al., Variance Reduction for Reinforcement Learning in Input-Driven
