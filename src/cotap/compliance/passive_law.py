@@ -66,8 +66,8 @@ class PassiveCoTaPLaw(CoTaPLaw, Remembering):
         room = self._store.available(level, state.dt)
         energy = spring_energy(stiffness, error) - spring_energy(old, before)
         share, known = torch.ones_like(level), energy.isfinite()
-        held = (energy > room) & known
-        if held.any():
+        held = ((energy > room) & known).nonzero(as_tuple=True)
+        if len(held[0]):
             stiffness, error = stiffness.clone(), error.clone()
             given = (x[held] for x in (old, stiffness, before, error, room))
             stiffness[held], error[held], share[held], energy[held] = held_spring(*given)
@@ -117,20 +117,34 @@ def held_spring(
     Returns:
         Stiffness and error to put in force, the share of the change that is made, and what it injects.
     """
+    reached, part, spent = _moved_rest(old, before, error, room)
+    held = held_stiffness(old, new, reached, room - spent)
+    return held.stiffness, reached, (part * held.share).to(error.dtype), spent + held.energy
+
+
+def _moved_rest(
+    stiffness: torch.Tensor, before: torch.Tensor, error: torch.Tensor, room: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """From an error `before` (R, n) towards `error` as far as `room` (R,) [J] allows: the error that is reached, the
+    share of the way (R,), 0 where rounding alone needs more, and the energy that it injects (R,) [J]."""
     shift = error - before
-    bend = spring_energy(old, shift)
-    slope = spring_energy(old, error) - spring_energy(old, before) - bend
+    if not shift.any():  # as always with the joint error
+        return error, torch.ones_like(room), torch.zeros_like(room)
+    held = spring_energy(stiffness, before)
+    bend = spring_energy(stiffness, shift)
+    slope = spring_energy(stiffness, error) - held - bend
     # Largest r with slope r + bend r^2 <= room, but for rounding.
-    most = room.double() - 1e-6 * spring_energy(old, before)
+    most = room.double() - 1e-6 * held
     root = (slope.square() + 4.0 * bend * most).clamp_min(0.0).sqrt()
     tiny = torch.finfo(root.dtype).tiny
     part = torch.where(slope > 0.0, 2.0 * most / (slope + root + tiny), (root - slope) / (2.0 * bend + tiny))
     whole = (slope + bend <= most) | (shift == 0.0).all(-1)
     part = torch.where(whole, 1.0, part.clamp(0.0, 1.0)).to(shift.dtype)
     reached = torch.where((part < 1.0).unsqueeze(-1), before + part.unsqueeze(-1) * shift, error)
-    spent = spring_energy(old, reached) - spring_energy(old, before)
+    spent = spring_energy(stiffness, reached) - held
     none = spent > room
-    reached, spent = torch.where(none.unsqueeze(-1), before, reached), torch.where(none, 0.0, spent)
-    held = held_stiffness(old, new, reached, room - spent)
-    share = torch.where(none, 0.0, part * held.share)
-    return held.stiffness, reached, share.to(shift.dtype), spent + held.energy
+    return (
+        torch.where(none.unsqueeze(-1), before, reached),
+        torch.where(none, 0.0, part),
+        torch.where(none, 0.0, spent),
+    )
