@@ -23,7 +23,7 @@ from cotap.agents.runner import DualRunner, check_run_dir
 from cotap.agents.runner_config import RunnerConfig
 
 TARGETS = {"lower": (0.8, -0.5, 0.3), "upper": (-0.7, 0.6)}
-TINY = {"hidden": (8, 8), "steps": 6, "epochs": 2, "mini_batches": 2, "precision": "fp32", "least_std": 10.0}
+TINY = {"hidden": (8, 8), "steps": 6, "epochs": 2, "mini_batches": 2, "precision": "fp32", "std_half_life": 0.0}
 
 
 class DummyEnv(VecEnv):

@@ -472,23 +472,32 @@ def test_smallest_sizes_that_are_allowed_learn_finite_parameters():
     assert all(bool(p.isfinite().all()) for p in learner.model.parameters())
 
 
-def test_spread_is_limited_more_and_more():
-    learner = make_learner(num_envs=10, steps=5, initial_std=0.8, std_half_life=100.0, least_std=0.3)
-    largest = []
-    for _ in range(5):
+def test_spread_narrows_on_schedule():
+    config = {"num_envs": 10, "steps": 5, "initial_std": 0.8, "std_half_life": 100.0, "least_std": 0.3}
+    learner, spreads = make_learner(**config), []
+    for i in range(5):
         with torch.no_grad():
             for log_std in learner.model.log_std.values():
-                log_std.fill_(1.0)
+                log_std.fill_(1.0 if i % 2 else -3.0)  # whatever was learned
         collect(learner)
         learner.update()
-        largest.append(float(learner.model.log_std["lower"].exp().max()))
-    assert largest == pytest.approx([0.8 * 0.5**0.5, 0.4, 0.3, 0.3, 0.3])
-    again = make_learner(num_envs=10, steps=5, initial_std=0.8, std_half_life=100.0, least_std=0.3)
+        spreads.append(learner.model.log_std["lower"].detach().exp().tolist())
+    expected = [0.8 * 0.5**0.5, 0.4, 0.3, 0.3, 0.3]
+    assert spreads == [pytest.approx([std] * len(spreads[0])) for std in expected]
+    again = make_learner(**config)
     again.load_state_dict(learner.state_dict())
     assert (again.iterations, again.samples) == (5, 250)
 
 
-def test_what_begins_wider_is_limited_from_there():
+def test_spread_is_learned_where_no_schedule_is_set():
+    learner = make_learner(num_envs=10, steps=5, initial_std=0.8, std_half_life=0.0, entropy=1.0, learning_rate=1e-2)
+    before = learner.model.log_std["lower"].detach().clone()
+    collect(learner)
+    learner.update()
+    assert bool((learner.model.log_std["lower"].detach() > before).all())  # the bonus widens it
+
+
+def test_what_begins_wider_narrows_from_there():
     """One action at 1.6, one at 0.1, the rest at 0.2: by hand, 100 samples halve the bound; also after a restart."""
     config = {"num_envs": 10, "steps": 5, "initial_std": 0.2, "std_half_life": 100.0, "least_std": 0.06}
     learner = make_learner(**config)

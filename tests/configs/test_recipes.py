@@ -223,7 +223,7 @@ def test_a_distillation_begins_with_what_its_base_ended_with():
     assert env.forces.pushes.enabled
     assert env.forces.pushes.ramp.share(0.0) == env.forces.hand_loads.ramp.share(0.0) == 1.0
     assert env.curriculum.arm_motion_samples == 0.0
-    assert training.ppo.initial_std == training.ppo.least_std
+    assert (training.ppo.initial_std, training.ppo.std_half_life) == (0.3, 150e6)
 
 
 def test_a_distillation_has_what_the_punch_tour_has():
@@ -238,19 +238,13 @@ def test_a_distillation_has_what_the_punch_tour_has():
     assert env.path.share > 0.0
 
 
-def test_exploration_goes_on_from_where_a_base_that_stopped_early_left_it():
-    base = BASE_RECIPES["default"]()
-    base.train_for(base.ppo.std_half_life)
-    assert DISTILL_RECIPES["default"](base).ppo.initial_std == pytest.approx(base.ppo.initial_std / 2, rel=1e-3)
-
-
 def test_what_begins_anew_explores_as_widely_as_the_first_run_did():
     base = BASE_RECIPES["default"]()
     base.ppo.initial_std = 0.7
     first = DISTILL_RECIPES["default"](base)
     second = DISTILL_RECIPES["default"](first)
     assert first.distillation.new_std == second.distillation.new_std == 0.7
-    assert first.ppo.initial_std == second.ppo.initial_std == base.ppo.least_std
+    assert first.ppo.initial_std == second.ppo.initial_std == 0.35
     assert DISTILL_RECIPES["modulated"](first).distillation.new_std == 1.0
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -35,8 +34,8 @@ class DualPPOConfig:
     """Hidden layers of every actor and critic."""
     initial_std: float = 0.6
     """Standard deviation of actions at the start."""
-    std_half_life: float = 74e6
-    """Samples in which the largest standard deviation allowed falls by half: wide at first, precise later."""
+    std_half_life: float = 150e6
+    """Samples in which it falls by half; 0 to learn it instead."""
     least_std: float = 0.12
     """Where that fall ends."""
     steps: int = 24
@@ -88,8 +87,8 @@ class DualPPOConfig:
             require_range(f"ppo.{name}", getattr(self, name), 0.0, 1.0)
         for name in ("initial_std", "least_std", "clip", "learning_rate", "desired_kl", "max_grad_norm"):
             require_range(f"ppo.{name}", getattr(self, name), 1e-8, 1e6)
-        for name in ("std_half_life", "kl_half_life"):
-            require_range(f"ppo.{name}", getattr(self, name), 1.0, 1e15)
+        require_range("ppo.std_half_life", self.std_half_life, 0.0, 1e15)
+        require_range("ppo.kl_half_life", self.kl_half_life, 1.0, 1e15)
         for name in ("entropy", "value", "value_clip"):
             require_range(f"ppo.{name}", getattr(self, name), 0.0, 1e3)
 
@@ -253,7 +252,7 @@ class DualPPO:
                         sums[f"{name}/{key}"] = sums.get(f"{name}/{key}", torch.zeros(())) + value
         self.iterations += 1
         self.samples += self._samples_per_iteration
-        self._limit_std()
+        self._narrow_std()
         count = {name: max(1, cfg.epochs * cfg.mini_batches - skipped[name]) for name in self.names}
         log = {key: float(value) / count[key.partition("/")[0]] for key, value in sums.items()}
         for name in self.names:
@@ -267,12 +266,14 @@ class DualPPO:
         return log
 
     @torch.no_grad()
-    def _limit_std(self) -> None:
+    def _narrow_std(self) -> None:
         cfg = self.cfg
+        if cfg.std_half_life == 0.0:
+            return
         share = 0.5 ** (self.samples / cfg.std_half_life)
         for name, log_std in self.model.log_std.items():
-            largest = [max(cfg.least_std, max(cfg.initial_std, begun) * share) for begun in self._begun_std[name]]
-            log_std.clamp_(max=torch.tensor([math.log(std) for std in largest], device=log_std.device))
+            now = [max(cfg.least_std, max(cfg.initial_std, begun) * share) for begun in self._begun_std[name]]
+            log_std.copy_(torch.tensor(now, device=log_std.device).log())
 
     def _update_agent(
         self, name: str, g: int, actor_in: torch.Tensor, critic_in: torch.Tensor, batch: dict[str, torch.Tensor],
@@ -321,7 +322,7 @@ class DualPPO:
         """Start with networks that are trained and optimisers that are not: from the lowest rate, since Adam's first
         steps are as large as its rate, whatever the gradient. Rates grow by themselves where a policy hardly moves.
 
-        An action whose standard deviation is wider than `initial_std` by now is limited from there on."""
+        An action whose standard deviation is wider than `initial_std` by now narrows from there on."""
         self.learning_rates = dict.fromkeys(self.names, LOWEST_RATE)
         self._begun_std = {name: own.detach().exp().tolist() for name, own in self.model.log_std.items()}
 

@@ -23,6 +23,7 @@ from cotap.envs.hand_loads import HandLoadConfig
 from cotap.envs.observations import ObservationConfig
 from cotap.envs.pushes import PushConfig
 from cotap.envs.rewards import UpperRewards
+from cotap.envs.terminations import TerminationConfig
 
 
 @dataclass
@@ -70,7 +71,14 @@ def default(robot: str = "h1") -> BaseTraining:
             assist=AssistConfig(enabled=True),
             curriculum=CurriculumConfig(arm_motion_samples=3e6),
             forces=ExternalForceConfig(
-                hand_loads=HandLoadConfig(enabled=True, episode_share=0.8, ramp=RampConfig(16e6, 60e6, first=0.1)),
+                hand_loads=HandLoadConfig(
+                    enabled=True,
+                    episode_share=0.8,
+                    force_x=(-50.0, 50.0),
+                    force_y=(-50.0, 50.0),
+                    force_z=(-60.0, 5.0),
+                    ramp=RampConfig(16e6, 60e6, first=0.1),
+                ),
                 pushes=PushConfig(
                     enabled=True,
                     velocity=(0.3, 1.2),
@@ -80,6 +88,8 @@ def default(robot: str = "h1") -> BaseTraining:
                     ramp=RampConfig(20e6, 80e6, first=0.3),
                 ),
             ),
+            # Further than what evaluations call a fall: who may not get there learns no way back.
+            terminations=TerminationConfig(min_height=0.35, max_tilt_rad=1.5),
         ),
         runner=RunnerConfig(iterations=12_207),
     )
@@ -91,7 +101,7 @@ def default(robot: str = "h1") -> BaseTraining:
 def quick(robot: str = "h1") -> BaseTraining:
     """Walking in the shortest time: no pushes, no loads; 30 M samples."""
     training = default(robot)
-    training.env.forces = ExternalForceConfig()
+    training.env.forces, training.env.terminations = ExternalForceConfig(), TerminationConfig()
     training.runner.iterations = 1220
     return training
 
@@ -120,7 +130,7 @@ def paper(robot: str = "h1") -> BaseTraining:
             ),
         ),
         ppo=DualPPOConfig(
-            hidden=(512, 256, 128), initial_std=0.8, std_half_life=1e12, entropy=0.01, epochs=5, learning_rate=1e-4,
+            hidden=(512, 256, 128), initial_std=0.8, std_half_life=0.0, entropy=0.01, epochs=5, learning_rate=1e-4,
             desired_kl=0.01, kl_half_life=1e12, symmetric=False, upper_gamma=0.99,
         ),
         runner=RunnerConfig(iterations=20_000),

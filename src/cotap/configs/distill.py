@@ -51,9 +51,9 @@ def default(base: BaseTraining) -> DistillTraining:
 
 
 def _for(training: DistillTraining, samples: float) -> None:
-    """So many samples, over which the change that updates aim at falls to a quarter, as it does over a base's."""
+    """So many samples, over which exploration and the change that updates aim at fall to a half and a quarter."""
     training.train_for(samples)
-    training.ppo.kl_half_life = samples / 2.0
+    training.ppo.std_half_life, training.ppo.kl_half_life = samples, samples / 2.0
 
 
 def quick(base: BaseTraining) -> DistillTraining:
@@ -73,20 +73,20 @@ def paper(base: BaseTraining) -> DistillTraining:
     training.env.forces.pushes.enabled = False
     training.distillation.anew = ()
     training.train_for(20_000 * training.ppo.steps * 4096)
-    training.ppo.kl_half_life = base.ppo.kl_half_life
+    training.ppo.std_half_life, training.ppo.kl_half_life = base.ppo.std_half_life, base.ppo.kl_half_life
     return training
 
 
 def _after_base(training: DistillTraining, base: BaseTraining) -> None:
-    """What the base has learned is there from the start, and exploration goes on from where the base's ended."""
+    """What the base has learned is there from the start."""
     env = training.env
     env.assist, env.curriculum = AssistConfig(), CurriculumConfig()
     env.forces.pushes.ramp, env.forces.hand_loads.ramp = RampConfig(), RampConfig()
-    halvings = base.samples / base.ppo.std_half_life
-    training.ppo.initial_std = max(base.ppo.least_std, base.ppo.initial_std * 0.5**halvings)
-    # What begins anew explores as widely as the first run did.
+    # What begins anew explores as widely as the first run did, all else half as widely: by where that run ended, little
+    # was learned any more.
     distilled = isinstance(base, DistillTraining)
     training.distillation.new_std = base.distillation.new_std if distilled else base.ppo.initial_std
+    training.ppo.initial_std = 0.5 * training.distillation.new_std
 
 
 def short(base: BaseTraining) -> DistillTraining:

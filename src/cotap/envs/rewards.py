@@ -126,6 +126,12 @@ def _velocity_error(s: StepRecord) -> torch.Tensor:
     return (s.command.velocity_h - s.state.torso_linear_velocity_h[:, :2]).square().sum(1)
 
 
+def _on_course(s: StepRecord) -> torch.Tensor:
+    """One at the commanded velocity, none far off. A robot that is pushed needs steps that no phase has: where it was
+    paid for the phase all the same, it stood on one leg as asked and fell."""
+    return torch.exp(-_velocity_error(s) / 0.25)
+
+
 def _linear(error: torch.Tensor, none_at: float) -> torch.Tensor:
     """One where there is no error, none at `none_at`, and minus one from twice that on. Without this bound, robots that
     step to catch themselves lose more, and the H1 fell more often when pushed (one training each)."""
@@ -169,14 +175,14 @@ class LowerRewards:
     @term(4.0)
     def track_velocity(s: StepRecord) -> torch.Tensor:
         """Velocity against its command, wide kernel: a direction to follow from far away."""
-        return torch.exp(-_velocity_error(s) / 0.25)
+        return _on_course(s)
 
     @term(1.5)
     def track_velocity_closely(s: StepRecord) -> torch.Tensor:
         """Velocity against its command, narrow kernel: the last tenth of a metre per second."""
         return torch.exp(-_velocity_error(s) / 0.04)
 
-    @term(3.0)
+    @term(5.0)
     def track_mean_velocity(s: StepRecord) -> torch.Tensor:
         """Velocity averaged over a stride, so that swaying is no reason to walk too slowly: one at its command, none at
         0.25 m/s off, forward and leftward errors added up. Linear: a kernel is flat for the slow walk that robots begin
@@ -199,7 +205,7 @@ class LowerRewards:
         one at its command, none at 0.3 rad/s off."""
         return _linear(s.mean_error[:, 2].abs(), 0.3)
 
-    @term(4.5)
+    @term(7.0)
     def track_height(s: StepRecord) -> torch.Tensor:
         """Height of the torso link against its command: one at it, none at 0.15 m off. Linear: a kernel is flat for
         robots that do not squat yet."""
@@ -234,16 +240,17 @@ class LowerRewards:
 
     @term(5.0)
     def contact_schedule(s: StepRecord) -> torch.Tensor:
-        """Share of feet that are on the ground, or off it, as the gait's phase asks."""
-        return (s.state.foot_contact == s.desired_contact).float().mean(1)
+        """Share of feet that are on the ground, or off it, as the phase asks; worth less the further the velocity
+        is off its command."""
+        return _on_course(s) * (s.state.foot_contact == s.desired_contact).float().mean(1)
 
     @term(-60.0)
     def swing_height(s: StepRecord) -> torch.Tensor:
         """How far the swinging soles are above or below the height that they should have [m]; linear: the first
-        centimetre is worth as much as the last."""
+        centimetre is worth as much as the last. It weighs less the further the velocity is off its command."""
         # Of both signs: swings that were only kept from being too low grew to 0.16 m.
         off = _sole_height(s.swing, s.scales.foot_clearance_m) - s.state.foot_pos_w[:, :, 2]
-        return (off.abs() * ~s.desired_contact).sum(1)
+        return _on_course(s) * (off.abs() * ~s.desired_contact).sum(1)
 
     @term(-5.0)
     def foot_slip(s: StepRecord) -> torch.Tensor:
