@@ -49,7 +49,7 @@ class RampConfig:
 class CurriculumConfig:
     """What many falls hold back. The assistance fades all the same: robots that keep it lean on it."""
 
-    max_falls_per_s: float = 0.06
+    max_falls_per_s: float = 0.1
     """Falls per second and env above which no disturbance grows and the arms' motion shrinks. Below, that grows back
     first: disturbances wait until it is whole."""
     arm_motion_samples: float = 0.0
