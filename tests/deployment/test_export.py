@@ -92,7 +92,8 @@ def test_metadata_is_what_a_robot_needs(robot, random_checkpoint, random_policy)
     assert (m.control_dt, m.gait["period_s"]) == (cfg.control_dt, cfg.gait.period_s)
     assert m.commands["acceleration"] == cfg.commands.acceleration
     assert m.nominal_height_m == spec.nominal_height_m
-    assert termination_config(m) == cfg.terminations
+    fall = termination_config(m)  # as evaluations have it, however far training goes on
+    assert (fall.min_height, fall.max_tilt_rad) == (0.5, 1.0)
     assert m.checkpoint_sha256 == sha256(random_checkpoint(robot=robot))
     proto = onnx.load(path)
     assert {o.domain: o.version for o in proto.opset_import}[""] == m.opset

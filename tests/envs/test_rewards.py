@@ -197,6 +197,9 @@ CASES = [
     ("contact_schedule", {"foot_force": [[250.0, 4.9]]}, 0.5),
     ("contact_schedule", {"desired_contact": [[False, False]]}, 0.0),
     ("contact_schedule", {"foot_force": [[250.0, 0.0]], "desired_contact": [[True, False]]}, 1.0),
+    # Half a metre a second off its command, a robot is asked for less.
+    ("contact_schedule", {"torso_linear_velocity_h": [[0.2, 0.2, 0.0]]}, math.exp(-1.0)),
+    ("swing_height", {**LEFT_LIFTED, "torso_linear_velocity_h": [[0.2, 0.2, 0.0]]}, 0.1 * math.exp(-1.0)),
     # Left foot in mid-swing should be 0.1 m up: it is on the floor, right, halfway, and too high.
     ("swing_height", LEFT_LIFTED, 0.1),
     ("swing_height", {**LEFT_LIFTED, "foot_pos_w": [[[3.0, -1.9, 0.1], [3.0, -2.1, 0.5]]]}, 0.0),

@@ -25,6 +25,7 @@ from cotap.envs import HumanoidEnvConfig
 from cotap.envs.actions import JointTargets
 from cotap.envs.modulation import Modulation
 from cotap.envs.observations import Term, actor_terms
+from cotap.envs.terminations import TerminationConfig
 from cotap.evaluation.policy import load_policy
 from cotap.files import write_atomically
 from cotap.robots import ROBOTS, RobotSpec
@@ -143,7 +144,7 @@ def describe(
         gait=to_plain(cfg.gait),
         commands=to_plain(cfg.commands),
         nominal_height_m=spec.nominal_height_m,
-        terminations=to_plain(cfg.terminations),
+        terminations=to_plain(TerminationConfig()),  # training may go on further
         law=to_plain(cfg.upper_body),
         golden=golden,
         checkpoint_sha256=checkpoint_sha256,
