@@ -12,6 +12,7 @@ import torch
 
 from cotap.configs import BASE_RECIPES, DISTILL_RECIPES, BaseTraining, DistillTraining, from_plain, to_plain
 from cotap.envs import HumanoidEnv
+from cotap.envs.terminations import TerminationConfig
 from cotap.robots import ROBOTS
 
 ENV = {
@@ -280,8 +281,17 @@ def test_updates_shrink_to_a_quarter_over_a_distillation_as_over_a_base(name: st
         assert training.ppo.desired_kl == 0.01
 
 
-def test_the_papers_updates_do_not_shrink():
+def test_training_goes_on_where_evaluations_see_a_fall_but_for_quick_and_paper():
+    fall = TerminationConfig()
+    ends = {name: make().env.terminations for name, make in BASE_RECIPES.items()}
+    assert (ends["default"].min_height, ends["default"].max_tilt_rad) == (0.35, 1.5)
+    assert ends["quick"] == ends["paper"] == fall
+    assert (fall.min_height, fall.max_tilt_rad) == (0.5, 1.0)
+
+
+def test_the_papers_updates_do_not_shrink_and_its_exploration_is_learned():
     base = BASE_RECIPES["paper"]()
+    assert DISTILL_RECIPES["paper"](base).ppo.std_half_life == base.ppo.std_half_life == 0.0
     assert DISTILL_RECIPES["paper"](base).ppo.kl_half_life == base.ppo.kl_half_life == 1e12
 
 

@@ -88,7 +88,7 @@ def default(robot: str = "h1") -> BaseTraining:
                     ramp=RampConfig(20e6, 80e6, first=0.3),
                 ),
             ),
-            # Further than what evaluations call a fall: who may not get there learns no way back.
+            # Further than what evaluations call a fall: strikes on its wrists tilt the G1's torso beyond that.
             terminations=TerminationConfig(min_height=0.35, max_tilt_rad=1.5),
         ),
         runner=RunnerConfig(iterations=12_207),

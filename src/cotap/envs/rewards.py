@@ -127,8 +127,8 @@ def _velocity_error(s: StepRecord) -> torch.Tensor:
 
 
 def _on_course(s: StepRecord) -> torch.Tensor:
-    """One at the commanded velocity, none far off. A robot that is pushed needs steps that no phase has: where it was
-    paid for the phase all the same, it stood on one leg as asked and fell."""
+    """One at the commanded velocity, none far off. A robot that is pushed needs steps that no phase has. Of those that
+    were paid for the phase all the same, some stood on one leg, as it asked, and fell over it."""
     return torch.exp(-_velocity_error(s) / 0.25)
 
 
