@@ -4,9 +4,10 @@ python -m reports.modulation_grid --checkpoint runs/modulated/checkpoint_002441.
 
 Writes modulation_grid.md and modulation_grid.json. A grid over alpha and a stiffness alike along all axes comes first;
 then stiffness is refined axis by axis around the best of it. The setting with the largest return, an oracle and the
-policy then run with another seed, so that luck in the grid does not count, each without and with an energy store. The
-oracle sets the laws by the hand's true state, which no policy sees, within the modulation's rates: for hands that are
-free, loaded and pushed it takes the setting of the grid that is best for that part. It says what there is to gain.
+policy then run with another seed, so that luck in the grid does not count, each without and with an energy store, and
+setting and policy also with the arms' raw reference in place of the policy's targets: targets can give way as laws can.
+The oracle sets the laws by the hand's true state, which no policy sees, within the modulation's rates: for hands that
+are free, loaded and pushed it takes the setting of the grid that is best for that part. It says what there is to gain.
 """
 
 from __future__ import annotations
@@ -167,8 +168,11 @@ def measure(options: Options) -> dict[str, Any]:
 
         here = [{"label": f"best constant: {_named(best)}", **tried(start, best)}]
         here.append({"label": "oracle: set by the hand's true state", **tried(start, by_state=by_state)})
+        bare: dict[str, Any] = {"upper_actions": "reference"}
+        here.append({"label": "best constant, raw reference", **tried(start, best, **bare)})
         if options.checkpoint:
             here.append({"label": "set by the policy", **tried(options.checkpoint)})
+            here.append({"label": "set by the policy, raw reference", **tried(options.checkpoint, **bare)})
         for row in here:
             more = {name: measure_difference(here[0], row, name, False) for name in COMPARED}
             rows.append(row | {"passive": passive, "less_constant": more})

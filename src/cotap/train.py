@@ -229,24 +229,22 @@ def _resumed_config(checkpoint: str, recipe: str, stage: str, kind: type[Any]) -
 
 
 def _base_config(checkpoint: str) -> BaseTraining:
-    """The config of a policy to begin from, for as many samples as it was trained on, but for rewards that are not
-    known here. Raises CheckpointError for one that cannot be used."""
+    """The config of a policy to begin from, but for rewards that are not known here and how it was distilled. Raises
+    CheckpointError for one that cannot be used."""
     from cotap.agents.checkpoint import load_checkpoint, require_parts
     from cotap.agents.run_log import say
     from cotap.configs.saved import without_unknown_terms
 
     content = load_checkpoint(checkpoint)
-    require_parts(checkpoint, content, ("kind", "layout", "model", "samples", "config"))
+    require_parts(checkpoint, content, ("kind", "layout", "model", "config"))
     plain = content["config"].get("training")
     unknown: list[str] = []
     if isinstance(plain, dict) and "env" in plain:
         plain["env"], unknown = without_unknown_terms(plain["env"])
+        plain.pop("distillation", None)
     if unknown:
         say(f"{checkpoint}: trained with rewards that are not known here and are left out: {', '.join(unknown)}")
-    kind = DistillTraining if content["kind"] == "distill" else BaseTraining
-    training = _config_of(checkpoint, content, kind)
-    training.train_for(content["samples"])
-    return training
+    return _config_of(checkpoint, content, BaseTraining)
 
 
 def _config_of(checkpoint: str, content: dict[str, Any], kind: type[Any]) -> Any:

@@ -16,6 +16,9 @@ from cotap.agents.distillation import DistillationConfig, Guide
 from cotap.agents.dual_ppo import DualPPO, DualPPOConfig
 from cotap.agents.runner import layout_of
 
+SAMPLES = 8 * TINY["steps"]
+"""Of an iteration of 8 envs."""
+
 
 def base_policy(seed: int = 5) -> DualActorCritic:
     torch.manual_seed(seed)
@@ -54,7 +57,7 @@ def test_an_agent_that_is_not_there_cannot_begin_anew():
 
 
 def test_weight_falls_linearly_to_zero():
-    guide = Guide(base_policy(), DistillationConfig(beta=0.8, end_iterations=10))
+    guide = Guide(base_policy(), DistillationConfig(beta=0.8, end_samples=10))
     assert [guide.beta(i) for i in (0, 5, 10, 99)] == pytest.approx([0.8, 0.4, 0.0, 0.0])
 
 
@@ -92,7 +95,7 @@ def distance(learner: DualPPO, base: DualActorCritic) -> float:
 
 def test_guidance_draws_the_guided_agent_to_the_base_and_leaves_the_other():
     base = base_policy()
-    held = guided(base, DistillationConfig(beta=5.0, end_iterations=1000), learning_rate=0.01, desired_kl=10.0)
+    held = guided(base, DistillationConfig(beta=5.0, end_samples=1e6), learning_rate=0.01, desired_kl=10.0)
     free = guided(base, DistillationConfig(beta=0.0), learning_rate=0.01, desired_kl=10.0)
     for learner in (held, free):
         for i in range(40):
@@ -106,7 +109,7 @@ def test_guidance_draws_the_guided_agent_to_the_base_and_leaves_the_other():
 
 
 def test_a_base_that_has_no_say_any_more_costs_nothing(monkeypatch: pytest.MonkeyPatch):
-    learner = guided(base_policy(), DistillationConfig(end_iterations=1))
+    learner = guided(base_policy(), DistillationConfig(end_samples=1))
     collect(learner)
     assert "lower/base_kl" in learner.update()
     monkeypatch.setattr(learner.guide, "mean_action", lambda _: pytest.fail("the base was asked"))
@@ -140,19 +143,19 @@ def test_the_base_is_never_changed_and_a_change_is_noticed():
 
 def test_guidance_goes_on_where_it_stopped():
     base = base_policy()
-    learner = guided(base, DistillationConfig(beta=1.0, end_iterations=10))
+    learner = guided(base, DistillationConfig(beta=1.0, end_samples=10 * SAMPLES))
     for i in range(3):
         collect(learner, seed=i)
         learner.update()
-    other = guided(base_policy(seed=6), DistillationConfig(beta=1.0, end_iterations=10))
+    other = guided(base_policy(seed=6), DistillationConfig(beta=1.0, end_samples=10 * SAMPLES))
     other.load_state_dict(copy.deepcopy(learner.state_dict()))
-    assert other.guide.beta(other.iterations) == pytest.approx(0.7)
+    assert other.guide.beta(other.samples) == pytest.approx(0.7)
     for key, value in base.state_dict().items():
         assert torch.equal(other.guide.model.state_dict()[key], value), key
     other.guide.verify()
 
 
-@pytest.mark.parametrize(("field", "value"), [("beta", -1.0), ("end_iterations", 0), ("agents", ("arms",))])
+@pytest.mark.parametrize(("field", "value"), [("beta", -1.0), ("end_samples", 0), ("agents", ("arms",))])
 def test_bad_fields_are_named(field, value):
     with pytest.raises(ValueError, match=rf"distillation\.{field}"):
         Guide(base_policy(), DistillationConfig(**{field: value}))

@@ -140,7 +140,7 @@ def test_closeness_to_the_reference_is_rewarded_while_distilling():
 def test_the_penalty_on_leaving_the_base_falls_to_zero_before_the_end():
     training = paper()[1]
     assert training.distillation.beta > 0.0
-    assert training.distillation.end_iterations < training.runner.iterations
+    assert training.distillation.end_samples < training.samples
 
 
 def test_observations_are_those_of_the_papers_table(env: HumanoidEnv):
@@ -241,11 +241,10 @@ def test_a_distillation_has_what_the_punch_tour_has():
 
 def test_what_begins_anew_explores_as_widely_as_the_first_run_did():
     base = BASE_RECIPES["default"]()
-    base.ppo.initial_std = 0.7
     first = DISTILL_RECIPES["default"](base)
     second = DISTILL_RECIPES["default"](first)
-    assert first.distillation.new_std == second.distillation.new_std == 0.7
-    assert first.ppo.initial_std == second.ppo.initial_std == 0.35
+    assert first.distillation.new_std == second.distillation.new_std == base.ppo.initial_std
+    assert first.ppo.initial_std == second.ppo.initial_std == 0.5 * base.ppo.initial_std
     assert DISTILL_RECIPES["modulated"](first).distillation.new_std == 1.0
 
 

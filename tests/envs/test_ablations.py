@@ -100,11 +100,13 @@ def test_ablations_differ_from_the_default_in_one_thing():
     base = BASE_RECIPES["default"]()
     expected = DISTILL_RECIPES["default"](base)
     expected.train_for(40e6)
+    expected.distillation.end_samples = 5e6
     expected.ppo.std_half_life, expected.ppo.kl_half_life = 40e6, 20e6
     expected.env.observations.arm_torque = "critic"
     assert DISTILL_RECIPES["torque-critic"](base) == expected
     expected = DISTILL_RECIPES["default"](base)
     expected.train_for(40e6)
+    expected.distillation.end_samples = 5e6
     expected.ppo.std_half_life, expected.ppo.kl_half_life = 40e6, 20e6
     expected.env.observations.goals = True
     assert DISTILL_RECIPES["goals"](base) == expected

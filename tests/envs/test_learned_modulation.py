@@ -85,7 +85,7 @@ def test_what_is_observed_is_what_is_in_force(make_env):
 
 
 def test_an_action_counts_as_far_as_it_does_something(make_env):
-    """Beyond the bounds it changes nothing, so that neither does the penalty on its change count it."""
+    """Beyond the bounds it changes nothing: what the next observation shows of it is the bound."""
     env = make_env(2, upper_body=laws("alpha"))
     env.step(asking(env, c0=7.0, c1=-7.0))
     first = env.record.action[0, -2:].tolist()

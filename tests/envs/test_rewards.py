@@ -283,6 +283,15 @@ def test_every_term_has_a_case_by_hand():
     assert {name for name, _, _ in CASES} == set(ALL_TERMS)
 
 
+def test_what_is_asked_of_laws_has_no_penalty():
+    """It comes behind the five joints."""
+    asked = dataclasses.replace(
+        perfect(), action=torch.tensor([[9, 9, 9, 1, -1, 7.0]]), last_action=torch.tensor([[0, 0, 0, 2, 2, 0.0]])
+    )
+    assert TERMS["upper_action_rate"](asked).tolist() == [10.0]
+    assert TERMS["lower_action_rate"](asked).tolist() == [243.0]
+
+
 @pytest.mark.parametrize("weights", [LowerRewards(), UpperRewards()], ids=["lower", "upper"])
 @pytest.mark.parametrize("changes", [changes for _, changes, _ in CASES])
 def test_no_fault_pays(weights, changes):

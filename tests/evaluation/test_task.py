@@ -18,7 +18,7 @@ from cotap.envs.modulation import ModulationConfig
 from cotap.envs.upper_body import UpperBodyConfig
 from cotap.evaluate import evaluate, main, parse, prepare
 from cotap.evaluation.law_options import LawOptions
-from cotap.evaluation.rollout import reference_actions
+from cotap.evaluation.rollout import acting, idle
 from cotap.evaluation.task import step_figures, task_measures
 from reports.modulation_grid import Options, Trial, asked, hand_states
 from reports.modulation_grid import main as grid
@@ -98,12 +98,17 @@ def test_constant_settings_hold_what_the_policy_would_set(protocol, options, hel
     env.step(policy(dict(env.get_observations().items())))
 
 
-def test_the_raw_reference_comes_with_the_configured_laws(make_env):
+def test_the_raw_reference_comes_with_the_laws_that_the_policy_asks_for(make_env):
     laws = LawOptions(method="cotap", alpha=0.3).configure()
     laws.modulation = ModulationConfig("alpha")
     env = make_env(2, upper_body=laws)
-    assert reference_actions(env).shape == (2, len(env.spec.upper_joints) + 2)
-    assert not reference_actions(env)[:, -2:].any()
+    asked = torch.rand(2, env.num_actions)
+    for share in (0.0, 0.25):
+        actions = acting(env, lambda _: asked, str(share))({})
+        assert torch.equal(actions[:, : env.num_lower], asked[:, : env.num_lower])
+        torch.testing.assert_close(actions[:, env.num_lower : -2], share * asked[:, env.num_lower : -2])
+        assert torch.equal(actions[:, -2:], asked[:, -2:])
+    assert not idle(env)({}).any()
 
 
 def test_its_alpha_is_what_was_asked_for(checkpoint_of, capsys):
@@ -192,8 +197,9 @@ def test_the_grid_compares_with_its_best(checkpoint_of, tmp_path, capsys):
     for measure, found in (("return", result["best"]), *((f"return_{k}", v) for k, v in result["by_state"].items())):
         assert found == max(result["grid"], key=lambda row: row["metrics"][measure]["mean"])["setting"], measure
     rows = result["compared"]
-    assert [row["passive"] for row in rows] == [False] * 3 + [True] * 3
-    constant, _, learned = rows[:3]
+    assert [row["passive"] for row in rows] == [False] * 5 + [True] * 5
+    constant, _, bare, learned, _ = rows[:5]
+    assert bare["less_constant"]["return"]["difference"] != 0.0  # its targets were the policy's
     assert not any(row["difference"] for row in constant["less_constant"].values())
     gained = learned["less_constant"]["return"]
     assert gained["pairs"] == 4

@@ -22,8 +22,8 @@ class DistillationConfig:
 
     beta: float = 0.1
     """Weight of `KL(new || base)` at the start."""
-    end_iterations: int = 200
-    """Iterations in which the weight falls linearly to zero."""
+    end_samples: float = 5e6
+    """Samples in which the weight falls linearly to zero."""
     agents: tuple[str, ...] = ("lower",)
     """Agents that are guided."""
     anew: tuple[str, ...] = ()
@@ -34,7 +34,7 @@ class DistillationConfig:
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
         require_range("distillation.beta", self.beta, 0.0, 1e3)
-        require_range("distillation.end_iterations", self.end_iterations, 1, 10**9)
+        require_range("distillation.end_samples", self.end_samples, 1.0, 1e15)
         require_range("distillation.new_std", self.new_std, 1e-8, 1e6)
         for field in ("agents", "anew"):
             for name in getattr(self, field):
@@ -78,9 +78,9 @@ class Guide:
         if self.fingerprint() != self._fingerprint:
             raise RuntimeError("the frozen base policy has changed during training")
 
-    def beta(self, iteration: int) -> float:
-        """Weight of the penalty in this iteration, counted from 0."""
-        return self.cfg.beta * max(0.0, 1.0 - iteration / self.cfg.end_iterations)
+    def beta(self, samples: float) -> float:
+        """Weight of the penalty after so many samples."""
+        return self.cfg.beta * max(0.0, 1.0 - samples / self.cfg.end_samples)
 
     @torch.no_grad()
     def mean_action(self, observations: Observations) -> torch.Tensor:
@@ -88,8 +88,10 @@ class Guide:
         return self.model(observations)
 
     def kl(self, name: str, mean: torch.Tensor, log_std: torch.Tensor, base_mean: torch.Tensor) -> torch.Tensor:
-        """Mean `KL(new || base)` of one agent's actions [nat], analytic for diagonal Gaussians."""
-        return gaussian_kl(mean, log_std, base_mean, self.model.log_std[name]).mean()
+        """Mean `KL(new || base)` of one agent's actions [nat], analytic for diagonal Gaussians. A `log_std` that is not
+        learned counts as the base's: what it adds could not be changed."""
+        base_std = self.model.log_std[name]
+        return gaussian_kl(mean, log_std if log_std.requires_grad else base_std, base_mean, base_std).mean()
 
     def state_dict(self) -> dict[str, Any]:
         """The frozen policy's weights, so that a run goes on without the file it began from."""

@@ -131,6 +131,8 @@ class DualPPO:
         self.dtype = resolve_precision(cfg.precision, device)
         self.names = tuple(layout.action_slices)
         self.model = DualActorCritic(layout, cfg.hidden, cfg.initial_std).to(device)
+        for log_std in self.model.log_std.values():
+            log_std.requires_grad_(cfg.std_half_life == 0.0)  # else it is on a schedule
         self._begun_std = {name: [0.0] * len(own) for name, own in self.model.log_std.items()}
         discounts = [cfg.upper_gamma if name == "upper" else cfg.gamma for name in self.names]
         self._discount = torch.tensor(discounts, device=device)
@@ -195,7 +197,7 @@ class DualPPO:
         std = torch.cat([model.log_std[n].exp() for n in self.names])
         actions = mean + std * torch.randn_like(mean)
         r.means[t], r.actions[t] = mean, actions
-        if self.guide and self.guide.beta(self.iterations) > 0.0 and r.guide_means is not None:
+        if self.guide and self.guide.beta(self.samples) > 0.0 and r.guide_means is not None:
             r.guide_means[t] = self.guide.mean_action(observations)
         for g, name in enumerate(self.names):
             part = self.layout.action_slices[name]
@@ -259,7 +261,7 @@ class DualPPO:
             log[f"{name}/skipped"] = float(skipped[name])
             log[f"{name}/learning_rate"] = self.learning_rates[name]
             if self.guide and name in self.guide.cfg.agents:
-                log[f"{name}/base_beta"] = self.guide.beta(self.iterations - 1)
+                log[f"{name}/base_beta"] = self.guide.beta(self.samples - self._samples_per_iteration)
             spread = r.means[..., self.layout.action_slices[name]].flatten(0, 1).std(0)
             log[f"{name}/action_spread"] = float(spread.mean())  # over states; at zero the policy answers none
             log[f"{name}/action_std"] = float(self.model.log_std[name].detach().exp().mean())
@@ -294,7 +296,7 @@ class DualPPO:
         entropy = gaussian_entropy(log_std)
         loss = surrogate + cfg.value * value_loss - cfg.entropy * entropy
         stats = {"surrogate": surrogate.detach(), "value": value_loss.detach(), "entropy": entropy.detach(), "kl": kl}
-        beta = self.guide.beta(self.iterations) if self.guide and name in self.guide.cfg.agents else 0.0
+        beta = self.guide.beta(self.samples) if self.guide and name in self.guide.cfg.agents else 0.0
         if self.guide and beta > 0.0:
             distance = self.guide.kl(name, mean, log_std, batch["guide_means"][:, part])
             penalty = beta * distance

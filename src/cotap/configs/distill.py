@@ -37,7 +37,8 @@ def default(base: BaseTraining) -> DistillTraining:
     env.upper_body = UpperBodyConfig(
         left=LawConfig(name="cotap"), right=LawConfig(name="cotap"), sampling=LawSampling(enabled=True, full_alpha=0.25)
     )
-    _after_base(training, base)
+    _after_base(training)
+    env.forces.hand_loads.episode_share = 0.5  # an arm under a load is not asked to be at its reference
     pushes = env.forces.pushes
     pushes.hand_share, pushes.link_share = 0.5, 0.3  # hands are what the law is for
     pushes.velocity, pushes.largest_pitch = (0.0, 1.5), 0.5 * math.pi
@@ -51,8 +52,10 @@ def default(base: BaseTraining) -> DistillTraining:
 
 
 def _for(training: DistillTraining, samples: float) -> None:
-    """So many samples, over which exploration and the change that updates aim at fall to a half and a quarter."""
+    """So many samples, over which exploration and the change that updates aim at fall to a half and a quarter, after an
+    eighth of them without the base's guidance."""
     training.train_for(samples)
+    training.distillation.end_samples = samples / 8.0
     training.ppo.std_half_life, training.ppo.kl_half_life = samples, samples / 2.0
 
 
@@ -71,21 +74,20 @@ def paper(base: BaseTraining) -> DistillTraining:
     sampling = LawSampling(enabled=True, stiffness=(150.0, 450.0), log_uniform=False)
     training.env.upper_body = UpperBodyConfig(left=pd_damped, right=copy.deepcopy(pd_damped), sampling=sampling)
     training.env.forces.pushes.enabled = False
+    training.env.forces.hand_loads.episode_share = base.env.forces.hand_loads.episode_share
     training.distillation.anew = ()
-    training.train_for(20_000 * training.ppo.steps * 4096)
+    _for(training, 20_000 * training.ppo.steps * 4096)
     training.ppo.std_half_life, training.ppo.kl_half_life = base.ppo.std_half_life, base.ppo.kl_half_life
     return training
 
 
-def _after_base(training: DistillTraining, base: BaseTraining) -> None:
+def _after_base(training: DistillTraining) -> None:
     """What the base has learned is there from the start."""
     env = training.env
     env.assist, env.curriculum = AssistConfig(), CurriculumConfig()
     env.forces.pushes.ramp, env.forces.hand_loads.ramp = RampConfig(), RampConfig()
-    # What begins anew explores as widely as the first run did, all else half as widely: by where that run ended, little
+    # What begins anew explores as widely as a base does at first, all else half as widely: by where a base ends, little
     # was learned any more.
-    distilled = isinstance(base, DistillTraining)
-    training.distillation.new_std = base.distillation.new_std if distilled else base.ppo.initial_std
     training.ppo.initial_std = 0.5 * training.distillation.new_std
 
 
@@ -157,5 +159,4 @@ DISTILL_RECIPES: dict[str, Callable[[BaseTraining], DistillTraining]] = {
     "facet": facet,
     "modulated": modulated,
 }
-"""Stage 2, by name. Each makes its configuration of the base's, whose `runner.iterations` are those that it was trained
-for."""
+"""Stage 2, by name. Each makes its configuration of the base's."""

@@ -394,8 +394,9 @@ class UpperRewards:
 
     @term(-0.02)
     def upper_action_rate(s: StepRecord) -> torch.Tensor:
-        """Squared change of the upper action."""
-        return (s.action - s.last_action)[:, _upper(s)].square().sum(1)
+        """Squared change of the arm joints' actions. Those that set laws have rates of their own: noise beyond their
+        bounds is cut off, so that a penalty would drive them there."""
+        return (s.action - s.last_action)[:, s.scales.num_lower : s.torque.shape[1]].square().sum(1)
 
     @term(-5.0)
     def upper_joint_limits(s: StepRecord) -> torch.Tensor:

@@ -131,14 +131,13 @@ def film_row(qpos: torch.Tensor, s: RobotState, hands_t: torch.Tensor, force_w: 
 
 
 def reference_actions(env: HumanoidEnv) -> torch.Tensor:
-    """Upper actions (N, U + M) that send the arms to their raw reference, under the laws as they are configured;
-    absolute ones to where it is now, which is one step late."""
+    """Actions (N, U) of the arms' joints that send them to their raw reference; absolute ones to where it is now, which
+    is one step late."""
     upper, targets = slice(env.num_lower, None), env.joint_targets
     reference = env.motions.current().position
-    laws = reference.new_zeros(len(reference), env.upper_body.modulation.size)
     if env.cfg.actions.upper_mode == "residual":
-        return torch.cat((torch.zeros_like(reference), laws), 1)
-    return torch.cat(((reference - targets.default[upper]) / targets.scale[upper], laws), 1)
+        return torch.zeros_like(reference)
+    return (reference - targets.default[upper]) / targets.scale[upper]
 
 
 def upper_share(upper_actions: str) -> float:
@@ -158,8 +157,8 @@ def upper_share(upper_actions: str) -> float:
 
 
 def acting(env: HumanoidEnv, policy: PolicyFunction, upper_actions: str) -> PolicyFunction:
-    """`policy` as it is, or with that `upper_share` of what its upper actions add to the arms' raw reference. A robot
-    whose base is held has no policy."""
+    """`policy` as it is, or with that `upper_share` of what its upper actions add to the arms' raw reference; what it
+    asks of the arms' laws stays. A robot whose base is held has no policy."""
     if env.cfg.fixed_base:
         return idle(env)
     share = upper_share(upper_actions)
@@ -167,16 +166,20 @@ def acting(env: HumanoidEnv, policy: PolicyFunction, upper_actions: str) -> Poli
         return policy
 
     def act(observations: dict[str, torch.Tensor]) -> torch.Tensor:
-        lower, upper = policy(observations).split([env.num_lower, env.num_actions - env.num_lower], 1)
-        return torch.cat((lower, torch.lerp(reference_actions(env), upper, share)), 1)
+        reference = reference_actions(env)
+        ends = (env.num_lower, env.num_lower + reference.shape[1])
+        lower, arms, laws = policy(observations).tensor_split(ends, 1)
+        return torch.cat((lower, torch.lerp(reference, arms, share), laws), 1)
 
     return act
 
 
 def idle(env: HumanoidEnv) -> PolicyFunction:
-    """A policy that leaves the legs in their default pose and sends the arms to their reference."""
+    """A policy that leaves the legs in their default pose and sends the arms to their reference, under the laws as they
+    are configured."""
     legs = torch.zeros(env.num_envs, env.num_lower, device=env.device)
-    return lambda _: torch.cat((legs, reference_actions(env)), 1)
+    laws = torch.zeros(env.num_envs, env.upper_body.modulation.size, device=env.device)
+    return lambda _: torch.cat((legs, reference_actions(env), laws), 1)
 
 
 def arm_static_torque(arms: Arms, s: RobotState, force_w: torch.Tensor) -> torch.Tensor:

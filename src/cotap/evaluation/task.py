@@ -95,8 +95,8 @@ def step_figures(env: HumanoidEnv) -> torch.Tensor:
 def task_measures(figures: torch.Tensor, alive: torch.Tensor) -> dict[str, torch.Tensor]:
     """Measures (N,) of figures (T, 8, N) as `step_figures` has them, over the steps that are `alive` (T, N).
 
-    The return and its parts are per second. Errors and torque are means over the hands and the time that they are of;
-    NaN where there is none.
+    The return and its parts are per second. Errors and resistance are means over the hands and the time that they are
+    of; NaN where there is none.
     """
     mean = [masked_mean(figure, alive) for figure in figures.unbind(1)]
     parts = {f"return_{name}": TASK_WEIGHTS[name] * value for name, value in zip(PARTS, mean[:3], strict=True)}

@@ -147,7 +147,8 @@ class Session:
             actions = torch.cat((actions[:1], self._policies[1](observations)[1:]))
         if not self.values["arm_actions"]:
             actions = actions.clone()
-            actions[:, self.env.action_slices["upper"]] = reference_actions(self.env)
+            reference = reference_actions(self.env)
+            actions[:, self.env.num_lower :][:, : reference.shape[1]] = reference
         return actions
 
     def _policy(self, name: str) -> Policy:
