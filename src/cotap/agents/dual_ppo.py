@@ -52,7 +52,7 @@ class DualPPOConfig:
     """Trace decay of the advantage estimates."""
     clip: float = 0.2
     """Clip range of the surrogate."""
-    value_clip: float = 0.2
+    value_clip: float = 0.0
     """Values are learnt no further than this from what they were when the rollout began; 0 for any distance."""
     entropy: float = 0.003
     """Weight of the entropy bonus."""

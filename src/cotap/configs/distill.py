@@ -38,7 +38,8 @@ def default(base: BaseTraining) -> DistillTraining:
         left=LawConfig(name="cotap"), right=LawConfig(name="cotap"), sampling=LawSampling(enabled=True, full_alpha=0.25)
     )
     _after_base(training)
-    env.forces.hand_loads.episode_share = 0.5  # an arm under a load is not asked to be at its reference
+    loads = env.forces.hand_loads
+    loads.episode_share = min(0.5, loads.episode_share)  # an arm under a load is not asked to be at its reference
     pushes = env.forces.pushes
     pushes.hand_share, pushes.link_share = 0.5, 0.3  # hands are what the law is for
     pushes.velocity, pushes.largest_pitch = (0.0, 1.5), 0.5 * math.pi
