@@ -72,7 +72,7 @@ def default(robot: str = "h1") -> BaseTraining:
             forces=ExternalForceConfig(
                 hand_loads=HandLoadConfig(
                     enabled=True,
-                    episode_share=0.8,
+                    episode_share=0.5,
                     force_x=(-50.0, 50.0),
                     force_y=(-50.0, 50.0),
                     force_z=(-60.0, 5.0),
@@ -80,6 +80,7 @@ def default(robot: str = "h1") -> BaseTraining:
                 ),
                 pushes=PushConfig(
                     enabled=True,
+                    episode_share=0.5,
                     velocity=(0.3, 1.2),
                     hand_share=0.25,
                     link_share=0.5,

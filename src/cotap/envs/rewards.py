@@ -182,14 +182,14 @@ class LowerRewards:
         """Velocity against its command, narrow kernel: the last tenth of a metre per second."""
         return torch.exp(-_velocity_error(s) / 0.04)
 
-    @term(5.0)
+    @term(10.0)
     def track_mean_velocity(s: StepRecord) -> torch.Tensor:
         """Velocity averaged over a stride, so that swaying is no reason to walk too slowly: one at its command, none at
-        0.25 m/s off, forward and leftward errors added up. Linear: a kernel is flat for the slow walk that robots begin
+        0.5 m/s off, forward and leftward errors added up. Linear: a kernel is flat for the slow walk that robots begin
         with, and a norm for the smaller of two errors."""
-        return _linear(s.mean_error[:, :2].abs().sum(1), 0.25)
+        return _linear(s.mean_error[:, :2].abs().sum(1), 0.5)
 
-    @term(1.0)
+    @term(8.0)
     def track_yaw_rate(s: StepRecord) -> torch.Tensor:
         """Angular velocity about the vertical against its command, wide kernel."""
         return torch.exp(-(s.command.yaw_rate - s.state.yaw_rate).square())
@@ -199,11 +199,11 @@ class LowerRewards:
         """Angular velocity about the vertical against its command, narrow kernel."""
         return torch.exp(-(s.command.yaw_rate - s.state.yaw_rate).square() / 0.06)
 
-    @term(3.0)
+    @term(6.0)
     def track_mean_yaw_rate(s: StepRecord) -> torch.Tensor:
         """Yaw rate averaged over a stride, so that robots that twist with every step are paid for turning all the same:
-        one at its command, none at 0.3 rad/s off."""
-        return _linear(s.mean_error[:, 2].abs(), 0.3)
+        one at its command, none at 0.6 rad/s off."""
+        return _linear(s.mean_error[:, 2].abs(), 0.6)
 
     @term(7.0)
     def track_height(s: StepRecord) -> torch.Tensor:
