@@ -168,11 +168,11 @@ CASES = [
     ("track_velocity", {"torso_linear_velocity_h": [[0.2, 0.2, 0.0]]}, math.exp(-(0.09 + 0.16) / 0.25)),
     ("track_velocity", {"torso_linear_velocity_h": [[0.5, -0.2, 9.0]]}, 1.0),
     ("track_velocity_closely", {"velocity_h": [[0.6, -0.2]]}, math.exp(-0.01 / 0.04)),
-    ("track_mean_velocity", {"mean_error": [[0.1, -0.05, 9.0]]}, 1.0 - (0.1 + 0.05) / 0.25),
-    ("track_mean_velocity", {"mean_error": [[0.0, 0.45, 0.0]]}, 1.0 - 0.45 / 0.25),
-    ("track_mean_velocity", {"mean_error": [[0.3, -0.5, 0.0]]}, -1.0),  # bounded
-    ("track_mean_yaw_rate", {"mean_error": [[9.0, 9.0, -0.1]]}, 1.0 - 0.1 / 0.3),
-    ("track_mean_yaw_rate", {"mean_error": [[0.0, 0.0, 0.7]]}, -1.0),
+    ("track_mean_velocity", {"mean_error": [[0.1, -0.05, 9.0]]}, 1.0 - (0.1 + 0.05) / 0.5),
+    ("track_mean_velocity", {"mean_error": [[0.0, 0.9, 0.0]]}, 1.0 - 0.9 / 0.5),
+    ("track_mean_velocity", {"mean_error": [[0.6, -0.7, 0.0]]}, -1.0),  # bounded
+    ("track_mean_yaw_rate", {"mean_error": [[9.0, 9.0, -0.1]]}, 1.0 - 0.1 / 0.6),
+    ("track_mean_yaw_rate", {"mean_error": [[0.0, 0.0, 1.3]]}, -1.0),
     ("track_yaw_rate", {"yaw_rate": [0.1]}, math.exp(-0.09)),
     ("track_yaw_rate_closely", {"yaw_rate": [0.3]}, math.exp(-0.01 / 0.06)),
     ("track_yaw_rate_closely", {"yaw_rate": [0.5]}, math.exp(-0.01 / 0.06)),

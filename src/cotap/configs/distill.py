@@ -41,6 +41,7 @@ def default(base: BaseTraining) -> DistillTraining:
     loads = env.forces.hand_loads
     loads.episode_share = min(0.5, loads.episode_share)  # an arm under a load is not asked to be at its reference
     pushes = env.forces.pushes
+    pushes.episode_share = max(0.8, pushes.episode_share)
     pushes.hand_share, pushes.link_share = 0.5, 0.3  # hands are what the law is for
     pushes.velocity, pushes.largest_pitch = (0.0, 1.5), 0.5 * math.pi
     env.path.share = 0.1
