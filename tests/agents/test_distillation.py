@@ -78,6 +78,17 @@ def test_penalty_is_the_kl_of_torch_distributions():
     assert "upper/base_kl" not in log
 
 
+def test_exploration_on_a_schedule_adds_nothing_to_the_penalty():
+    """By hand: half the squared distance of the means in deviations of the base, whatever the new policy's."""
+    base = base_policy()
+    learner = guided(base, DistillationConfig(), std_half_life=1e6, initial_std=0.9)
+    mean, far = torch.zeros(4, 3), torch.full((4, 3), 0.2)
+    log_std = learner.model.log_std["lower"]
+    assert not log_std.requires_grad
+    assert float(learner.guide.kl("lower", mean, log_std, mean)) == 0.0
+    assert float(learner.guide.kl("lower", far, log_std, mean)) == pytest.approx(3 * 0.5 * (0.2 / 0.4) ** 2, rel=1e-5)
+
+
 def test_the_base_sees_raw_observations_through_its_own_normalisers():
     base = base_policy()
     base.update_normalizers({"policy": torch.randn(50, 6) * 9.0, "privileged": torch.randn(50, 2)})

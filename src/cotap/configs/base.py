@@ -93,7 +93,7 @@ def default(robot: str = "h1") -> BaseTraining:
     )
     if robot == "g1":
         training.env.actions.waist_share = 0.5  # three joints in the waist
-        # What the punch tour does: pushes, most of them on limbs. Of G1's falls three in four were under loads.
+        # What the punch tour does: pushes, most of them on limbs. Loads made three in four of its falls.
         loads, pushes = training.env.forces.hand_loads, training.env.forces.pushes
         loads.episode_share, pushes.episode_share = 0.3, 1.0
         pushes.interval_s, pushes.hand_share, pushes.link_share = (1.5, 4.0), 0.15, 0.7
