@@ -324,7 +324,7 @@ def test_a_fall_is_paid_for_once(make_env, robot):
     env = make_env(2, robot=robot)
     knock_over(env, 1)
     *_, extras = env.step(zeros(env))
-    assert float(extras["log"]["/lower/fall"]) == pytest.approx(0.5 * -10.0)
+    assert float(extras["log"]["/lower/fall"]) == pytest.approx(0.5 * -50.0)
     assert float(extras["log"]["/lower/alive"]) == pytest.approx(0.5 * 0.3 * 0.02)
 
 
