@@ -38,10 +38,8 @@ def default(base: BaseTraining) -> DistillTraining:
         left=LawConfig(name="cotap"), right=LawConfig(name="cotap"), sampling=LawSampling(enabled=True, full_alpha=0.25)
     )
     _after_base(training)
-    loads = env.forces.hand_loads
-    loads.episode_share = min(0.5, loads.episode_share)  # an arm under a load is not asked to be at its reference
     pushes = env.forces.pushes
-    pushes.episode_share = max(0.8, pushes.episode_share)
+    pushes.episode_share = 0.8
     pushes.hand_share, pushes.link_share = 0.5, 0.3  # hands are what the law is for
     pushes.velocity, pushes.largest_pitch = (0.0, 1.5), 0.5 * math.pi
     env.path.share = 0.1
@@ -54,8 +52,8 @@ def default(base: BaseTraining) -> DistillTraining:
 
 
 def _for(training: DistillTraining, samples: float) -> None:
-    """So many samples, over which exploration and the change that updates aim at fall to a half and a quarter, after an
-    eighth of them without the base's guidance."""
+    """So many samples, over which exploration and the change that updates aim at fall to a half and a quarter. The base
+    guides for an eighth of them."""
     training.train_for(samples)
     training.distillation.end_samples = samples / 8.0
     training.ppo.std_half_life, training.ppo.kl_half_life = samples, samples / 2.0
@@ -76,7 +74,6 @@ def paper(base: BaseTraining) -> DistillTraining:
     sampling = LawSampling(enabled=True, stiffness=(150.0, 450.0), log_uniform=False)
     training.env.upper_body = UpperBodyConfig(left=pd_damped, right=copy.deepcopy(pd_damped), sampling=sampling)
     training.env.forces.pushes.enabled = False
-    training.env.forces.hand_loads.episode_share = base.env.forces.hand_loads.episode_share
     training.distillation.anew = ()
     _for(training, 20_000 * training.ppo.steps * 4096)
     training.ppo.std_half_life, training.ppo.kl_half_life = base.ppo.std_half_life, base.ppo.kl_half_life

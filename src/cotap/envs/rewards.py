@@ -314,8 +314,7 @@ class LowerRewards:
 
     @term(-50.0, once=True)
     def fall(s: StepRecord) -> torch.Tensor:
-        """One when the episode ends in a fall. It costs more than any struggle: at 10, a recovery that succeeded two
-        times in three was worth less than to give up (G1, by what its critic expected)."""
+        """One when the episode ends in a fall. At 10, giving up was worth more than a struggle to recover (G1)."""
         return s.fell.float()
 
 

@@ -147,8 +147,8 @@ class Session:
             actions = torch.cat((actions[:1], self._policies[1](observations)[1:]))
         if not self.values["arm_actions"]:
             actions = actions.clone()
-            reference = reference_actions(self.env)
-            actions[:, self.env.num_lower :][:, : reference.shape[1]] = reference
+            reference, first = reference_actions(self.env), self.env.num_lower
+            actions[:, first : first + reference.shape[1]] = reference
         return actions
 
     def _policy(self, name: str) -> Policy:
