@@ -20,8 +20,8 @@ def heading(yaw: float) -> torch.Tensor:
     return torch.tensor([[[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]])
 
 
-def pilot(*waypoints: tuple[float, float, float], limits=WIDE, position=(0.0, 0.0), yaw=0.0) -> Pilot:
-    return Pilot(torch.tensor([waypoints]), 5.0, limits, torch.tensor([position]), torch.tensor([yaw]))
+def pilot(*waypoints: tuple[float, float, float], limits=WIDE, position=(0.0, 0.0), yaw=0.0, speed=math.inf) -> Pilot:
+    return Pilot(torch.tensor([waypoints]), 5.0, limits, torch.tensor([position]), torch.tensor([yaw]), speed)
 
 
 def ask(pilot: Pilot, time_s: float, x: float, y: float, yaw: float) -> tuple[list[float], float, bool]:
@@ -71,6 +71,14 @@ def test_commands_keep_within_the_policy_s_own_limits():
     assert ask(p, 0.0, 0.0, 0.0, 0.0) == (pytest.approx([0.8, 0.2]), pytest.approx(0.5), False)
     back = ask(pilot((-0.9, -0.5, -2.0), limits=narrow), 0.0, 0.0, 0.0, 0.0)
     assert back == (pytest.approx([-0.3, -0.2]), pytest.approx(-0.5), False)
+
+
+def test_commands_keep_their_direction_under_a_limit_of_the_speed():
+    """1.5 times (0.8, 0.6) m is 1.5 m/s: a third of it goes under a limit of 0.5 m/s, and the turn is left."""
+    slow = pilot((0.8, 0.6, 1.0), speed=0.5)
+    assert ask(slow, 0.0, 0.0, 0.0, 0.0) == (pytest.approx([0.4, 0.3]), pytest.approx(1.5), False)
+    assert ask(slow, 0.0, 0.6, 0.6, 0.0)[0] == pytest.approx([0.3, 0.0])  # slower than the limit as it is
+    assert ask(slow, 0.0, 0.8, 0.6, 1.0) == ([0.0, 0.0], 0.0, True)
 
 
 def test_a_position_is_reached_under_10_cm_and_left_beyond_20_cm():

@@ -98,7 +98,7 @@ def _run(
     robot.place(start, np.zeros(len(start) - 1))
     _ask(controller, torch.zeros(1, 2), torch.zeros(1), torch.zeros(1), robot.spec)
     controller.restart()
-    pilot = Pilot(waypoints, tour.segment_s, controller.commands.cfg, *_pelvis(robot))
+    pilot = Pilot(waypoints, tour.segment_s, controller.commands.cfg, *_pelvis(robot), tour.speed_limit)
     scorer, free = tour.scorer(1, joints), np.zeros((len(robot.spec.arms), 3))
     links = {body.joint: body.name for body in robot.spec.bodies}
     film: list[torch.Tensor] = []

@@ -58,6 +58,9 @@ class Tour(Protocol):
     episode_seconds: float = 90.0
     """Length of a tour, which all waypoints share [s]."""
 
+    speed_limit: float = 0.5
+    """Fastest velocity that is commanded [m/s], where the policy's own ranges go further. The benchmark leaves both to
+    each policy: HOMIE has 0.4 m/s, decoupled_wbc 0.55 m/s along each axis."""
     engine: str = "mujoco"
     """mujoco or pybullet. mujoco runs all at once, pybullet one after the other in the loop of `cotap deploy`."""
     per_env: bool = False
@@ -70,6 +73,7 @@ class Tour(Protocol):
         require_one_of("engine", self.engine, ENGINES)
         if self.engine != "mujoco":
             self.require_default("randomize", f"in {self.engine}")
+        require_range("speed_limit", self.speed_limit, 1e-3, 10.0)
         require_one_of("upper_actions", self.upper_actions, UPPER_ACTIONS)
         require_range("waypoints", require_positive_int("waypoints", self.waypoints), 1, 10_000)
         require_range("episode_seconds", self.episode_seconds, CONTROL_S, 3600.0)
@@ -166,7 +170,7 @@ class Tour(Protocol):
         env.motions.place(*arms_at(self._targets, 0.0))
         qpos = self.stance.start().to(env.device).repeat(env.num_envs, 1)
         obs = env.reset((qpos, torch.zeros_like(env.sim.qvel, dtype=qpos.dtype)))
-        self.pilot = Pilot(self._waypoints, self.segment_s, env.cfg.commands, *_pelvis(env))
+        self.pilot = Pilot(self._waypoints, self.segment_s, env.cfg.commands, *_pelvis(env), self.speed_limit)
         return obs
 
     @staticmethod

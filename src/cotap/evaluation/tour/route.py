@@ -35,20 +35,21 @@ class Pilot:
         waypoints: (N, W, 3) x, y [m] and yaw [rad] in the frame of the pelvis at release.
         segment_s: Time for each [s].
         limits: Ranges of commands that the policy was trained with.
+        speed_limit: Fastest velocity that is commanded, whatever its direction [m/s].
         position_w: (N, 2) of the pelvis at release [m].
         yaw: (N,) of the pelvis at release [rad].
     """
 
     def __init__(
         self, waypoints: torch.Tensor, segment_s: float, limits: CommandConfig, position_w: torch.Tensor,
-        yaw: torch.Tensor,
+        yaw: torch.Tensor, speed_limit: float = math.inf,
     ) -> None:  # fmt: skip
         c, s = yaw.cos().unsqueeze(1), yaw.sin().unsqueeze(1)
         x, y, turn = waypoints.to(position_w).unbind(2)
         forward = torch.stack((c * x - s * y, s * x + c * y), 2)
         self.waypoints_w = torch.cat((position_w.unsqueeze(1) + forward, (yaw.unsqueeze(1) + turn).unsqueeze(2)), 2)
         """(N, W, 3) x, y [m] and yaw [rad] in the world."""
-        self._segment_s, self._limits, self._segment = segment_s, limits, -1
+        self._segment_s, self._limits, self._speed_limit, self._segment = segment_s, limits, speed_limit, -1
         self._at_position = torch.zeros(len(waypoints), dtype=torch.bool, device=position_w.device)
         self._at_yaw = torch.zeros_like(self._at_position)
 
@@ -82,6 +83,7 @@ class Pilot:
         limits = self._limits
         velocity = GAIN * rotate_inverse(heading_w[:, :2, :2], way_w)
         velocity = torch.stack((velocity[:, 0].clamp(*limits.velocity_x), velocity[:, 1].clamp(*limits.velocity_y)), 1)
+        velocity = velocity * (self._speed_limit / velocity.norm(dim=1, keepdim=True)).clamp_max(1.0)
         yaw_rate = (GAIN * turn).clamp(*limits.yaw_rate)
         velocity = velocity.masked_fill(self._at_position.unsqueeze(1), 0.0)
         return velocity, yaw_rate.masked_fill(self._at_yaw, 0.0), self._at_position & self._at_yaw
