@@ -178,7 +178,6 @@ CASES = [
     ("track_yaw_rate_closely", {"yaw_rate": [0.5]}, math.exp(-0.01 / 0.06)),
     ("track_height", {"torso_pos_w": [[3.0, -2.0, 0.96]]}, 1.0 - 0.04 / 0.15),
     ("track_height", {"torso_pos_w": [[3.0, -2.0, 1.03]]}, 1.0 - 0.03 / 0.15),
-    ("track_height", {"torso_pos_w": [[3.0, -2.0, 1.03]], "stand": [1.0]}, 2.0 * (1.0 - 0.03 / 0.15)),
     ("track_height", {"torso_pos_w": [[3.0, -2.0, 0.6]]}, -1.0),
     # Standing 0.1 m behind the middle of the feet, heading to (0.05, -0.06) m of it.
     ("capture_point", {**STANDING, "torso_pos_w": [[2.9, -2.0, HEIGHT]]}, math.exp(-(0.05**2 + 0.06**2) / 0.01)),

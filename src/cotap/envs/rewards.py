@@ -205,11 +205,11 @@ class LowerRewards:
         one at its command, none at 0.6 rad/s off."""
         return _linear(s.mean_error[:, 2].abs(), 0.6)
 
-    @term(5.0)
+    @term(7.0)
     def track_height(s: StepRecord) -> torch.Tensor:
-        """Height of the torso link against its command: one at it, none at 0.15 m off, and twice that while standing,
-        when heights are commanded. Linear: a kernel is flat for robots that do not squat yet."""
-        return (1.0 + s.command.stand) * _linear((s.command.height - s.state.height).abs(), 0.15)
+        """Height of the torso link against its command: one at it, none at 0.15 m off. Linear: a kernel is flat for
+        robots that do not squat yet."""
+        return _linear((s.command.height - s.state.height).abs(), 0.15)
 
     @term(0.75)
     def capture_point(s: StepRecord) -> torch.Tensor:
