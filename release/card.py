@@ -102,7 +102,7 @@ def card(names: list[str], folder: Path) -> str:
     about = {name: json.loads((folder / f"{name}.json").read_text()) for name in names}
     lines = [HEAD, f"| | H1 | G1 | {' | '.join(f'`{name}`' for name in names)} |", "|---" * (3 + len(names)) + "|"]
     trained = [f"{about[name]['samples'] / 1e6:.0f} M" for name in names]
-    lines.append(f"| samples | 300 M, CoTaP 150 M | the same | {' | '.join(trained)} |")
+    lines.append(f"| samples | 300 M, CoTaP 75 M | the same | {' | '.join(trained)} |")
     for measure in MEASURES:
         cells = []
         for name in names:

@@ -34,7 +34,7 @@ def test_what_is_missed_is_bold_by_what_is_asked_of_the_robot(tmp_path: Path, mo
     write(tmp_path, "h1-base", "h1", falls=0.008, yaw=1.08)
     write(tmp_path, "g1-base", "g1", falls=0.008, yaw=0.94)
     lines = card.card(["h1-base", "g1-base"], tmp_path).splitlines()
-    assert "| samples | 300 M, CoTaP 150 M | the same | 12 M | 12 M |" in lines
+    assert "| samples | 300 M, CoTaP 75 M | the same | 12 M | 12 M |" in lines
     assert "| falls [%] | at most 0.5 | at most 1 | **0.8 (0.4 to 1.6)** | 0.8 (0.4 to 1.6) |" in lines
     assert "| slope yaw | 0.93 to 1.07 | 0.93 to 1.07 | **1.08 (1.07 to 1.09)** | 0.94 (0.93 to 0.95) |" in lines
 

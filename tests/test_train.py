@@ -776,8 +776,8 @@ def test_without_a_stage_both_run_and_are_summed_up(tmp_path: Path, monkeypatch:
 @pytest.mark.slow
 def test_the_quick_pipeline_is_a_small_version_of_both(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     assert PipelineOptions(quick=True).iterations() == (1220, 610)
-    assert PipelineOptions().iterations() == (12_207, 6103)
-    assert PipelineOptions(num_envs=2048).iterations() == (6103, 3051)  # as many samples
+    assert PipelineOptions().iterations() == (12_207, 3051)
+    assert PipelineOptions(num_envs=2048).iterations() == (6103, 1525)  # as many samples
     assert PipelineOptions(recipe="paper").iterations() == (20_000, 20_000)
     assert PipelineOptions(recipe="paper", num_envs=1024).iterations() == (80_000, 80_000)
     tiny_networks(monkeypatch)

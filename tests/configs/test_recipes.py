@@ -224,7 +224,7 @@ def test_a_distillation_begins_with_what_its_base_ended_with():
     assert env.forces.pushes.enabled
     assert env.forces.pushes.ramp.share(0.0) == env.forces.hand_loads.ramp.share(0.0) == 1.0
     assert env.curriculum.arm_motion_samples == 0.0
-    assert (training.ppo.initial_std, training.ppo.std_half_life) == (0.3, 150e6)
+    assert (training.ppo.initial_std, training.ppo.std_half_life) == (0.3, 75e6)
 
 
 def test_a_distillation_has_what_the_punch_tour_has():
@@ -257,7 +257,7 @@ def test_facets_reward_is_that_of_both_stages():
 @pytest.mark.parametrize(
     ("names", "samples"),
     [
-        (["default"], 150e6),
+        (["default"], 75e6),
         (["quick"], 15e6),
         (["short", "no-ratio", "torque-critic", "goals", "facet"], 40e6),
         (["paper"], 20_000 * 24 * 4096),

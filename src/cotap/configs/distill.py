@@ -29,7 +29,7 @@ class DistillTraining(BaseTraining):
 
 
 def default(base: BaseTraining) -> DistillTraining:
-    """The base's own environment and networks, with arms under CoTaP over a wide range of stiffness; 150 M samples."""
+    """The base's own environment and networks, with arms under CoTaP over a wide range of stiffness; 75 M samples."""
     training = DistillTraining(
         seed=base.seed, env=copy.deepcopy(base.env), ppo=copy.deepcopy(base.ppo), runner=copy.deepcopy(base.runner)
     )
@@ -47,7 +47,7 @@ def default(base: BaseTraining) -> DistillTraining:
     env.rewards.upper.reference_closeness = 1.0
     if env.actions.upper_mode == "residual":
         training.distillation.anew = ("upper",)  # under PD it has learned to resist loads
-    _for(training, 150e6)
+    _for(training, 75e6)
     return training
 
 
