@@ -42,7 +42,7 @@ class Pilot:
 
     def __init__(
         self, waypoints: torch.Tensor, segment_s: float, limits: CommandConfig, position_w: torch.Tensor,
-        yaw: torch.Tensor, speed_limit: float = math.inf,
+        yaw: torch.Tensor, speed_limit: float,
     ) -> None:  # fmt: skip
         c, s = yaw.cos().unsqueeze(1), yaw.sin().unsqueeze(1)
         x, y, turn = waypoints.to(position_w).unbind(2)
