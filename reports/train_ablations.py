@@ -21,7 +21,7 @@ from cotap.pipeline import Stopped
 from cotap.train import run_stage
 
 TRAININGS: dict[str, list[str]] = {
-    **{f"seed-{seed}": ["--recipe", "short", "--seed", str(seed)] for seed in range(3)},
+    **{f"seed-{seed}": ["--recipe", "quick", "--seed", str(seed)] for seed in range(3)},
     **{name: ["--recipe", name] for name in ("no-ratio", "torque-critic", "goals", "facet")},
 }
 """By the policy's name in `reports.reproduce_paper`."""

@@ -53,7 +53,7 @@ def test_what_they_differ_in_is_not_overridden(asked, tmp_path):
     last = {name: {o: args[len(args) - args[::-1].index(o)] for o in ("--recipe", "--seed")}
             for name, args in zip(TRAININGS, asked, strict=True)}  # fmt: skip
     assert [last[f"seed-{seed}"]["--seed"] for seed in range(3)] == ["0", "1", "2"]
-    assert {last[f"seed-{seed}"]["--recipe"] for seed in range(3)} == {"short"}
+    assert {last[f"seed-{seed}"]["--recipe"] for seed in range(3)} == {"quick"}
     assert all(last[name]["--recipe"] == name for name in ("no-ratio", "torque-critic", "goals", "facet"))
 
 

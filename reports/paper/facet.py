@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from reports.paper.ablation import samples, twin
 from reports.paper.arms import NULL_STIFFNESS
 from reports.paper.book import Book, kept
 from reports.paper.words import missing, the_paper
@@ -12,7 +13,8 @@ STATIC_ENVS, STRUCK_ENVS = 384, 256
 WHAT = """All laws at 500 N/m and k_null {null} Nm/rad, in stance, arms held, with the policy's own arm actions. {rows}
 First 10, 30 and 50 N down on the left hand, robots nominal; displacements are relative to before the load. Then pushes
 on it along x."""
-OWN = "The row *facet* has the policy `facet`, all others `cotap`."
+OWN = """The row *facet* has the policy `facet`, trained on {facet} M samples, all others `{cotap}`, on {samples} M.
+`facet` also begins with the base's arm agent, where CoTaP's begins anew."""
 SHARED = "There is no policy `facet`: all rows have `cotap`."
 WHY = """{paper} has a hand that rises under 10 and 30 N with CoTaP alone, and goes down under 50 N; ours goes down by
 {cotap} cm. FACET moves the reference by F / K, and PD yields on top of it: {facet} cm. Under CoTaP + FACET
@@ -23,14 +25,16 @@ def facet(book: Book) -> None:
     """Displacements under loads, and what a hand does after a push, law by law."""
     book.add("", "## FACET and other laws (the paper's Table VI and Fig. 9)")
     own = book.has("facet")
-    book.paragraph(WHAT, null=NULL_STIFFNESS, rows=OWN if own else SHARED)
-    if not book.has("cotap"):
-        book.paragraph(missing("cotap"))
+    cotap = twin(book) if own else "cotap"
+    if not book.has(cotap):
+        book.paragraph(missing(cotap))
         return
+    rows = OWN.format(facet=samples(book, "facet"), cotap=cotap, samples=samples(book, cotap)) if own else SHARED
+    book.paragraph(WHAT, null=NULL_STIFFNESS, rows=rows)
     from reports.compare_laws import Static, Transient
 
     common: dict[str, Any] = {
-        "checkpoint": book.policies["cotap"], "facet_checkpoint": book.policies["facet"] if own else "",
+        "checkpoint": book.policies[cotap], "facet_checkpoint": book.policies["facet"] if own else "",
         "null_stiffness": float(NULL_STIFFNESS), "upper_actions": "policy", "threads": book.threads,
     }  # fmt: skip
     at_rest = measured(

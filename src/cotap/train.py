@@ -81,10 +81,10 @@ class DistillOptions:
     """Policy to start from, a base or a distilled one: a file, or a shipped policy's name. It guides the new policy as
     well. By default the base that ships of --robot."""
     recipe: str = "default"
-    """default, quick, paper, short, facet, modulated, no-ratio, torque-critic or goals. default: 80 to 1200 N/m. quick
-    and short: the same, 15 M and 40 M samples. paper: 150 to 450 N/m. facet: arms under PD, FACET's tracking reward.
-    modulated: the policy sets alpha and stiffness. The others are ablations. Where networks see or do something else
-    than the base's, those are refitted."""
+    """default, quick, paper, facet, modulated, no-ratio, torque-critic or goals. default: 80 to 1200 N/m. quick: the
+    same, 15 M samples. paper: 150 to 450 N/m. facet: arms under PD, FACET's tracking reward. modulated: the policy sets
+    alpha and stiffness. The others are ablations of quick. Where networks see or do something else than the base's,
+    those are refitted."""
     command: tyro.conf.Suppress[str] = ""
     training: Annotated[DistillTraining, tyro.conf.arg(name="")] = field(default_factory=DistillTraining)
 

@@ -95,19 +95,12 @@ def test_the_threshold_of_the_ratio_is_the_laws_own(make_env):
         LawConfig("cotap", condition_threshold=0.5).check()
 
 
-def test_ablations_differ_from_the_default_in_one_thing():
-    """And in their samples, over which exploration and updates shrink."""
+def test_ablations_differ_from_the_quick_recipe_in_one_thing():
     base = BASE_RECIPES["default"]()
-    expected = DISTILL_RECIPES["default"](base)
-    expected.train_for(40e6)
-    expected.distillation.end_samples = 5e6
-    expected.ppo.std_half_life, expected.ppo.kl_half_life = 40e6, 20e6
+    expected = DISTILL_RECIPES["quick"](base)
     expected.env.observations.arm_torque = "critic"
     assert DISTILL_RECIPES["torque-critic"](base) == expected
-    expected = DISTILL_RECIPES["default"](base)
-    expected.train_for(40e6)
-    expected.distillation.end_samples = 5e6
-    expected.ppo.std_half_life, expected.ppo.kl_half_life = 40e6, 20e6
+    expected = DISTILL_RECIPES["quick"](base)
     expected.env.observations.goals = True
     assert DISTILL_RECIPES["goals"](base) == expected
 

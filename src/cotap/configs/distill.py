@@ -60,7 +60,7 @@ def _for(training: DistillTraining, samples: float) -> None:
 
 
 def quick(base: BaseTraining) -> DistillTraining:
-    """The beginnings of compliance in the shortest time; 15 M samples."""
+    """Compliance in the shortest time, and what ablations change one part of; 15 M samples."""
     training = default(base)
     _for(training, 15e6)
     return training
@@ -90,16 +90,9 @@ def _after_base(training: DistillTraining) -> None:
     training.ppo.initial_std = 0.5 * training.distillation.new_std
 
 
-def short(base: BaseTraining) -> DistillTraining:
-    """What ablations change one part of and are compared with: `default`, 40 M samples."""
-    training = default(base)
-    _for(training, 40e6)
-    return training
-
-
 def without_ratio(base: BaseTraining) -> DistillTraining:
     """Ablation: compliance does not give way to PD near singular arms (paper, Table IV)."""
-    training = short(base)
+    training = quick(base)
     training.env.upper_body.singularity_ratio = False
     return training
 
@@ -107,14 +100,14 @@ def without_ratio(base: BaseTraining) -> DistillTraining:
 def with_torque_for_critics(base: BaseTraining) -> DistillTraining:
     """Ablation: the arms' torque is seen by the critics only (paper, appendix C). So it is for the base that guides:
     its networks, refitted, take the torque for what it is on average."""
-    training = short(base)
+    training = quick(base)
     training.env.observations.arm_torque = "critic"
     return training
 
 
 def with_goals(base: BaseTraining) -> DistillTraining:
     """Ablation: actors see stiffness and alpha as commanded."""
-    training = short(base)
+    training = quick(base)
     training.env.observations.goals = True
     return training
 
@@ -122,7 +115,7 @@ def with_goals(base: BaseTraining) -> DistillTraining:
 def facet(base: BaseTraining) -> DistillTraining:
     """FACET as the paper trains it (appendix D): its tracking reward on the data's own motion, arms under PD. Forces
     move the reference in evaluation alone, by the law `facet`."""
-    training = short(base)
+    training = quick(base)
     training.env.upper_body = UpperBodyConfig()
     training.distillation.anew = ()
     training.env.rewards.upper.reference_closeness = 0.0  # which is CoTaP's
@@ -150,7 +143,6 @@ def modulated(base: BaseTraining) -> DistillTraining:
 DISTILL_RECIPES: dict[str, Callable[[BaseTraining], DistillTraining]] = {
     "default": default,
     "quick": quick,
-    "short": short,
     "paper": paper,
     "no-ratio": without_ratio,
     "torque-critic": with_torque_for_critics,
