@@ -4,10 +4,11 @@ python -m reports.modulation_grid --checkpoint runs/modulated/checkpoint_002441.
 
 Writes modulation_grid.md and modulation_grid.json. A grid over alpha and a stiffness alike along all axes comes first;
 then stiffness is refined axis by axis around the best of it. The setting with the largest return, an oracle and the
-policy then run with another seed, so that luck in the grid does not count, each without and with an energy store, and
-setting and policy also with the arms' raw reference in place of the policy's targets: targets can give way as laws can.
-The oracle sets the laws by the hand's true state, which no policy sees, within the modulation's rates: for hands that
-are free, loaded and pushed it takes the setting of the grid that is best for that part. It says what there is to gain.
+policy then run with another seed, so that luck in the grid does not count, each without and with an energy store, the
+setting also with the policy's own legs, which have learned to stand in the task. Targets of the arms are their raw
+reference throughout, because targets can give way as laws can. The oracle sets the laws by the hand's true state, which
+no policy sees, within the modulation's rates: for hands that are free, loaded and pushed it takes the setting of the
+grid that is best for that part. It says what there is to gain.
 """
 
 from __future__ import annotations
@@ -48,6 +49,8 @@ REFINED_BY = (4.0, 2.0)
 """Factors by which the stiffness along axes is changed, one after the other, around the best setting."""
 AXES = ((0,), (1,), (2,), (0, 1))
 """Axes whose stiffness is changed together: each of x, y and z, and the horizontal ones."""
+STANDARD = "h1-cotap"
+"""The policy whose legs carry constant settings."""
 STORE = {False: "no store", True: "store"}
 
 Setting = tuple[float, float, float, float]
@@ -61,8 +64,7 @@ class Options:
     checkpoint: str = ""
     """The policy that sets the laws; empty for none: best constant setting and oracle alone."""
     constant_checkpoint: str = ""
-    """The policy that runs with constant settings and the oracle's, such as one that was trained for the task with
-    `--modulation none`; empty for the same one, or else h1-cotap."""
+    """The policy whose legs carry the grid, the best setting and the oracle; empty for h1-cotap."""
     alphas: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 1.0)
     """Of the grid."""
     stiffnesses: tuple[float, ...] = (80.0, 160.0, 300.0, 600.0, 1200.0)
@@ -158,21 +160,22 @@ def measure(options: Options) -> dict[str, Any]:
     grid = _grid(options)
     best = _best(grid, "return")
     by_state = tuple(_best(grid, f"return_{part}") for part in PARTS)
-    start = options.constant_checkpoint or options.checkpoint or "h1-cotap"
+    start = options.constant_checkpoint or STANDARD
     rows: list[dict[str, Any]] = []
     for passive in (False, True):
 
-        def tried(path: str, constant: Setting | None = None, passive: bool = passive, **more: Any) -> dict[str, Any]:
-            trial = Trial(num_envs=options.num_envs, seed=options.seed + 1, per_env=True, passive=passive, **more)
+        def tried(
+            path: str, constant: Setting | None = None, by_state: tuple[Setting, ...] = (), passive: bool = passive
+        ) -> dict[str, Any]:
+            again = {"num_envs": options.num_envs, "seed": options.seed + 1, "per_env": True}
+            trial = Trial(**again, upper_actions="reference", by_state=by_state, passive=passive)
             return _run(options, path, trial, constant)
 
         here = [{"label": f"best constant: {_named(best)}", **tried(start, best)}]
         here.append({"label": "oracle: set by the hand's true state", **tried(start, by_state=by_state)})
-        bare: dict[str, Any] = {"upper_actions": "reference"}
-        here.append({"label": "best constant, raw reference", **tried(start, best, **bare)})
         if options.checkpoint:
+            here.append({"label": "best constant, the policy's legs", **tried(options.checkpoint, best)})
             here.append({"label": "set by the policy", **tried(options.checkpoint)})
-            here.append({"label": "set by the policy, raw reference", **tried(options.checkpoint, **bare)})
         for row in here:
             more = {name: measure_difference(here[0], row, name, False) for name in COMPARED}
             rows.append(row | {"passive": passive, "less_constant": more})
@@ -183,13 +186,13 @@ def measure(options: Options) -> dict[str, Any]:
 
 def _grid(options: Options) -> list[dict[str, Any]]:
     """Every setting of the grid, and those around its best, with what they got."""
-    path = options.constant_checkpoint or options.checkpoint or "h1-cotap"
+    path = options.constant_checkpoint or STANDARD
     rows: list[dict[str, Any]] = []
 
     def add(settings: list[Setting]) -> None:
         for setting in settings:
             print(f"  {_named(setting)}", file=sys.stderr)
-            trial = Trial(num_envs=options.grid_envs, seed=options.seed)
+            trial = Trial(num_envs=options.grid_envs, seed=options.seed, upper_actions="reference")
             rows.append({"setting": setting, **_run(options, path, trial, setting)})
 
     add(options.settings())

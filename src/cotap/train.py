@@ -83,8 +83,8 @@ class DistillOptions:
     recipe: str = "default"
     """default, quick, paper, facet, modulated, no-ratio, torque-critic or goals. default: 80 to 1200 N/m. quick: the
     same, 15 M samples. paper: 150 to 450 N/m. facet: arms under PD, FACET's tracking reward. modulated: the policy sets
-    alpha and stiffness. The others are ablations of quick. Where networks see or do something else than the base's,
-    those are refitted."""
+    alpha and stiffness, no arm targets. The others are ablations of quick. Where networks see or do something else than
+    the base's, those are refitted."""
     command: tyro.conf.Suppress[str] = ""
     training: Annotated[DistillTraining, tyro.conf.arg(name="")] = field(default_factory=DistillTraining)
 

@@ -172,6 +172,7 @@ def test_a_policy_that_sets_the_laws_says_what_it_asks_of_them(kind, each, rando
             [math.log(k) + float(a) for k, a in zip(law.stiffness, action[arm, 1:], strict=False)], abs=1e-5
         )
     assert float(action.abs().max()) > 0.02
+    np.testing.assert_allclose(out[11:19], m.golden["readings"][-1]["arm_reference"], atol=1e-6)  # targets stay there
     about = m.observation["about"]
     assert about["law_alpha"]["range"] == [0.0, 1.0]
     assert ("law_log_stiffness" in about) == (kind == "stiffness")

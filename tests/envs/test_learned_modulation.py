@@ -11,6 +11,7 @@ from env_tools import NOMINAL, STILL, history_of, newest, zeros
 from cotap.compliance.laws import LawConfig
 from cotap.configs import to_plain
 from cotap.envs import HumanoidEnv
+from cotap.envs.actions import ActionConfig
 from cotap.envs.modulation import Modulation, ModulationConfig
 from cotap.envs.upper_body import LawSampling, UpperBodyConfig
 
@@ -73,7 +74,7 @@ def test_parameters_go_where_actions_ask_at_their_rates(make_env):
     assert torch.equal(p.null_stiffness, torch.full((2, 2), 40.0))
 
 
-def test_what_is_observed_is_what_is_in_force(make_env):
+def test_what_is_observed_is_what_was_asked_for(make_env):
     env = make_env(2, upper_body=laws("stiffness"))
     obs, *_ = env.step(asking(env, c0=-9.0, c1=9.0))
     now = newest(env, obs["policy"])
@@ -82,6 +83,17 @@ def test_what_is_observed_is_what_is_in_force(make_env):
     assert now["law_log_stiffness"][0].tolist() == pytest.approx(logs, abs=1e-5)
     assert history_of(env, obs["policy"])["law_alpha"][0, :, 0].tolist() == pytest.approx([0.4] * 4 + [0.32], abs=1e-6)
     assert not now["last_action"].any()
+
+
+@pytest.mark.parametrize("mode", ["residual", "absolute"])
+def test_arms_are_sent_to_their_reference_whatever_is_asked_of_them(make_env, robot, mode):
+    env = make_env(2, robot=robot, upper_body=laws("alpha"), actions=ActionConfig(upper_mode=mode))
+    obs, *_ = env.step(torch.full((2, env.num_actions), 0.5))
+    now, lower = newest(env, obs["policy"]), env.num_lower
+    assert torch.equal(env.actuation.current[:, lower:], now["reference_arm_position"])
+    assert not now["last_action"][:, lower:].any()
+    assert (now["last_action"][:, :lower] == 0.5).all()
+    assert (env.record.action[:, len(env.spec.joints) :] == 0.5).all()
 
 
 def test_an_action_counts_as_far_as_it_does_something(make_env):

@@ -197,9 +197,9 @@ def test_the_grid_compares_with_its_best(checkpoint_of, tmp_path, capsys):
     for measure, found in (("return", result["best"]), *((f"return_{k}", v) for k, v in result["by_state"].items())):
         assert found == max(result["grid"], key=lambda row: row["metrics"][measure]["mean"])["setting"], measure
     rows = result["compared"]
-    assert [row["passive"] for row in rows] == [False] * 5 + [True] * 5
-    constant, _, bare, learned, _ = rows[:5]
-    assert bare["less_constant"]["return"]["difference"] != 0.0  # its targets were the policy's
+    assert [row["passive"] for row in rows] == [False] * 4 + [True] * 4
+    constant, _, own_legs, learned = rows[:4]
+    assert own_legs["less_constant"]["return"]["difference"] != 0.0  # they are another policy's
     assert not any(row["difference"] for row in constant["less_constant"].values())
     gained = learned["less_constant"]["return"]
     assert gained["pairs"] == 4

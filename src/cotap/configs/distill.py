@@ -133,6 +133,7 @@ def modulated(base: BaseTraining) -> DistillTraining:
     for name, weight in TASK_WEIGHTS.items():
         setattr(env.rewards.upper, name, weight)
     env.rewards.upper.track_arms = env.rewards.upper.track_key_points = 0.0  # which would not give way
+    env.rewards.upper.reference_closeness = 0.0  # targets are the reference
     training.distillation.anew = ()
     training.distillation.new_std = 1.0  # of what is asked of the laws, whose rates smooth it
     training.ppo.upper_gamma = 0.97  # a hand that gave way takes half a second to return

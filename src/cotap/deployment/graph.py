@@ -43,18 +43,16 @@ class TargetGraph(nn.Module):
     """What is exported: raw observations (N, W) to joint targets (N, J) [rad], and with learned modulation to what is
     asked of the laws (N, M). The arms' reference is the newest one observed."""
 
-    def __init__(
-        self, model: DualActorCritic, targets: JointTargets, modulation: Modulation, clip: float, reference: slice
-    ) -> None:
+    def __init__(self, model: DualActorCritic, targets: JointTargets, modulation: Modulation, reference: slice) -> None:
         super().__init__()
         self.model = model
-        self._targets, self._modulation, self._clip, self._reference = targets, modulation, clip, reference
+        self._targets, self._modulation, self._reference = targets, modulation, reference
 
     def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """All outputs."""
-        action = self.model({"policy": observation}).clamp(-self._clip, self._clip)
-        joints = action.shape[1] - self._modulation.size
-        targets = self._targets(action[:, :joints], observation[:, self._reference])
+        action, bound = self.model({"policy": observation}), self._targets.bound
+        joints = len(bound)
+        targets = self._targets(action[:, :joints].clamp(-bound, bound), observation[:, self._reference])
         if not self._modulation.size:
             return (targets,)
         return targets, self._modulation.wanted(action[:, joints:])
@@ -88,10 +86,10 @@ def export_policy(checkpoint: Path | str, output: Path, checks: int = 1000, seed
     layout = {"joints": list(spec.joint_names), "terms": [list(t) for t in terms], "history": history}
     layout |= cfg.upper_body.modulation.layout(sides)
     require_layout(checkpoint, policy.layout, layout)
-    targets = JointTargets(cfg.actions, spec)
+    targets = JointTargets(cfg.actions, spec, cfg.upper_body.modulation.kind != "none")
     reference = newest(terms, history, "reference_arm_position")
     modulation = Modulation(cfg.upper_body.modulation, [cfg.upper_body.of(side) for side in sides], cfg.control_dt)
-    graph = TargetGraph(policy.model, targets, modulation, cfg.actions.clip, reference).eval()
+    graph = TargetGraph(policy.model, targets, modulation, reference).eval()
     with torch.no_grad():
         steps, observation = golden_steps(
             cfg, spec, terms, history, lambda seen: graph(seen)[0],
@@ -137,7 +135,7 @@ def describe(
         kd=[j.kd for j in joints],
         torque_limit_nm=[cfg.torque_limit_scale * j.torque_limit_nm for j in joints],
         action={"scale_rad": [round(v, 9) for v in targets.scale.tolist()], "clip": cfg.actions.clip,
-                "upper_mode": cfg.actions.upper_mode, **({"law_targets": modulated} if modulated else {})},
+                "upper_mode": targets.upper_mode, **({"law_targets": modulated} if modulated else {})},
         observation={"terms": [list(t) for t in terms], "history": cfg.observations.history,
                      "about": about_terms(cfg, spec, terms), "order": ORDER, "frames": FRAMES},
         control_dt=cfg.control_dt,

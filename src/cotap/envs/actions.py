@@ -40,9 +40,16 @@ class ActionConfig:
 
 
 class JointTargets:
-    """Joint targets (N, J) [rad] of clipped actions (N, J) and the arms' reference position (N, U) [rad]."""
+    """Joint targets (N, J) [rad] of clipped actions (N, J) and the arms' reference position (N, U) [rad].
 
-    def __init__(self, cfg: ActionConfig, spec: RobotSpec) -> None:
+    Args:
+        cfg: Of actions.
+        spec: The robot's.
+        modulated: Whether the upper agent sets the arms' laws. Targets are the reference then: they could give way as
+            laws do, and what either is worth could not be seen.
+    """
+
+    def __init__(self, cfg: ActionConfig, spec: RobotSpec, modulated: bool = False) -> None:
         cfg.check()
         self.default = torch.tensor([j.default_rad for j in spec.joints])
         """(J,) [rad]."""
@@ -51,10 +58,15 @@ class JointTargets:
         shares = [min(1.0, j.torque_limit_nm / j.kp) * waist.get(j.name, 1.0) for j in lower]
         self.scale = torch.tensor([cfg.lower_scale * share for share in shares] + [cfg.upper_scale] * upper)
         """(J,) radians per unit of action."""
-        self._residual = cfg.upper_mode == "residual"
+        self.bound = torch.full_like(self.scale, cfg.clip)
+        """(J,) largest magnitude of each action."""
+        if modulated:
+            self.bound[len(lower) :] = 0.0
+        self.upper_mode = "residual" if modulated else cfg.upper_mode
+        """What upper actions are added to, as `ActionConfig` has it."""
 
     def __call__(self, action: torch.Tensor, arm_reference: torch.Tensor) -> torch.Tensor:
         offset = self.default.expand_as(action)
-        if self._residual:
+        if self.upper_mode == "residual":
             offset = torch.cat((offset[:, : -arm_reference.shape[1]], arm_reference), 1)
         return offset + self.scale * action

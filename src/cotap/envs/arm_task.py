@@ -1,6 +1,7 @@
 """A task of the arms in which no constant law is best: hold a free hand, carry a load, give way to a push.
 
-What helps two of these hurts the third, and a policy sees only from what happens to the arm which one it is.
+What helps two of these hurts the third. A policy sees which one it is from what happens to the arms alone: loads come
+on both hands and last, pushes come on one.
 """
 
 from __future__ import annotations

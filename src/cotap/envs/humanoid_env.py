@@ -91,16 +91,15 @@ class HumanoidEnv(VecEnv):
         limit = cfg.torque_limit_scale * torch.tensor([j.torque_limit_nm for j in spec.joints])
         self.reader = StateReader(spec, self.sim)
         self.arm_limits = self.reader.arm_joints(limit.unsqueeze(0))[0]
-        self.joint_targets = JointTargets(cfg.actions, spec)
+        self.joint_targets = JointTargets(cfg.actions, spec, cfg.upper_body.modulation.kind != "none")
         self.commands = CommandSource(cfg.commands, cfg.gait, n, spec.nominal_height_m, dt)
         self.motions = ReferenceMotion(cfg.motions, spec, n, dt)
         self.path = PathFollower(cfg.path, n, dt)
         self.forces = ExternalForces(cfg.forces, spec, model, self.reader, self.arm_limits, n, dt)
         self.randomizer = Randomizer(cfg.randomization, spec, self.sim)
         self.upper_body = UpperBody(cfg.upper_body, spec, n, dt)
-        whole = torch.full((self._num_joints,), cfg.actions.clip)
-        modulated = self.upper_body.modulation.action_bounds
-        self._action_bounds = [torch.cat((side * whole, own)) for side, own in zip((-1.0, 1.0), modulated, strict=True)]
+        own, laws = self.joint_targets.bound, self.upper_body.modulation.action_bounds
+        self._action_bounds = [torch.cat((side * own, law)) for side, law in zip((-1.0, 1.0), laws, strict=True)]
         self.actuation = Actuation(spec, self.sim, self.randomizer, self.upper_body, limit)
         self.observer = Observer(cfg.observations, spec, n, cfg.upper_body.modulation)
         self.recorder = Recorder(spec, self.reader, n, dt, cfg.gait.period_s)
