@@ -14,7 +14,6 @@ from pathlib import Path
 
 from cotap.robots import ROBOTS
 from reports.paper.ablation import ablation, samples
-from reports.paper.beyond import beyond
 from reports.paper.book import POLICIES, Book
 from reports.paper.constant_load import constant_load
 from reports.paper.facet import facet
@@ -26,7 +25,6 @@ from reports.paper.periodic import periodic
 from reports.paper.pictures import pictures
 from reports.paper.sim_to_sim import sim_to_sim
 from reports.paper.tables import PAPER_ROBOT
-from reports.paper.tour import tour
 from reports.paper.walking import walking
 
 PARTS: dict[str, Callable[[Book], None]] = {
@@ -40,8 +38,6 @@ PARTS: dict[str, Callable[[Book], None]] = {
     "walking": walking,
     "sim-to-sim": sim_to_sim,
     "field": field,
-    "beyond": beyond,
-    "tour": tour,
     "pictures": pictures,
 }
 HEAD = """Written by `{command}`: do not edit. {envs} envs a row unless said otherwise. Means are over the envs that
@@ -65,7 +61,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Parse, measure, write the page. Returns the exit status; bad input ends the program with 2."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--robot", default=PAPER_ROBOT, choices=tuple(ROBOTS), help="whose policies are measured")
-    parser.add_argument("--quick", action="store_true", help="128 envs a row, a short punch tour")
+    parser.add_argument("--quick", action="store_true", help="128 envs a row")
     parser.add_argument("--num-envs", type=int, default=0, help="envs a row; 4096, or 128 with --quick")
     parser.add_argument("--threads", type=int, default=0, help="0 takes every CPU")
     parser.add_argument("--only", nargs="+", default=[], metavar="PART", help=f"parts: {', '.join(PARTS)}")

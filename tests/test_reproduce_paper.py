@@ -17,7 +17,7 @@ from cotap.agents.checkpoint import sha256
 from cotap.evaluate import pictures
 from reports import reproduce_paper as rp
 from reports.compare_laws import Static, Transient
-from reports.paper import ablation, facet, fidelity, observation, relative, sim_to_sim, tour, walking, words
+from reports.paper import ablation, facet, fidelity, observation, relative, sim_to_sim, walking, words
 from reports.paper.arms import COMPLIANT, PD, SOFT, arms, label
 from reports.paper.book import Book
 from reports.paper.tables import IMPACT, ORDERINGS
@@ -280,51 +280,6 @@ def test_only_evaluations_of_the_same_policy_and_settings_are_kept(book, monkeyp
         assert (not asked) == kept
     assert str(book.folder) not in json.dumps(book.summary())
     assert book.summary()["rows"]["row"]["arguments"][:3] == ["impact", "--num-envs", "4"]
-
-
-def a_tour(survival_s: list[float], seed: int = 0) -> dict[str, Any]:
-    """A result of the tour in which all was measured, and survival run by run."""
-    measures = {name: {"mean": 0.5, "std": 0.1, "ci95": [0.4, 0.6]} for name in tour.MEASURES}
-    envs = {"stood": [1.0] * len(survival_s), "survival_s": survival_s}
-    return {"settings": {"seed": seed}, "metrics": measures, "per_env": envs}
-
-
-@pytest.mark.parametrize("robot", ["h1", "g1"])
-def test_the_tour_is_measured_in_both_engines_and_compared_run_by_run(robot, tmp_path, monkeypatch):
-    book = Book(robot, tmp_path, tmp_path, envs=64)
-    asked: dict[tuple[str, ...], int] = {}
-
-    def run(name, policy, *args, envs):
-        asked[(policy, *args)] = envs
-        book.results[name] = a_tour([10.0, 90.0] if "pd" in args else [12.0, 94.0])
-        return book.results[name]
-
-    monkeypatch.setattr(book, "run", run)
-    monkeypatch.setattr(tour, "find_spec", lambda name: name == "pybullet")
-    tour.tour(book)
-    compliant = ("--method", "cotap", "--stiffness", "300")
-    assert asked == {
-        (policy, "tour", "--engine", engine, *law): runs
-        for engine, runs in (("mujoco", 64), ("pybullet", 50))
-        for policy, law in (("base", ("--method", "pd")), ("cotap", ("--method", "pd")), ("cotap", compliant))
-    }
-    page = "\n".join(book.lines)
-    row = "0.5±0.1 | 50.0±10.0 | 50.0±10.0 | 28.6±5.7 | 0.0±0.0 | 0.0±0.0 |"
-    assert f"| base | PD | MuJoCo | 64 | {row}" in page
-    assert f"| cotap | CoTaP, K 300 | PyBullet | 50 | {row}" in page
-    assert ("| homie | PD | MuJoCo / PhysX | 512 or more | 78.2 / 79 | 55 / 58 |" in page) == (robot == "g1")
-    assert "| mean survival [s] | 3.0±1.0 better | 3.0±1.0 better |" in page
-    assert "| completed [%] | 0.0±14.1 not distinguishable |" in page  # square-and-add of 10 and 10
-    assert book.differences["tour, mujoco: survival_s"]["pairs"] == 2
-
-
-def test_that_pybullet_is_not_there_is_said(tmp_path, monkeypatch):
-    monkeypatch.setattr(tour, "find_spec", lambda _: None)
-    monkeypatch.setattr(Book, "run", lambda *_, **__: None)
-    book = Book("h1", tmp_path, tmp_path, quick=True)
-    tour.tour(book)
-    assert any("PyBullet is not installed" in line for line in book.lines)
-    assert not any("| PyBullet |" in line for line in book.lines)
 
 
 @pytest.fixture

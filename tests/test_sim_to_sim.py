@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,6 @@ from cotap.evaluation.disturbance import ConstantLoad, Impact
 from cotap.evaluation.law_options import parse_law
 from cotap.evaluation.policy import shipped_checkpoint
 from cotap.robots import RobotSpec
-from reports import sim_to_sim as script
 from reports.paper import engines
 from reports.paper.arms import arms as impact_arms
 from reports.paper.constant_load import ROWS as LOADS
@@ -169,23 +169,20 @@ def test_a_small_comparison_is_written_whole(tmp_path, monkeypatch):
     export_policy(shipped_checkpoint("h1-base"), policy, checks=20)
     monkeypatch.setattr(engines, "laws_by_part", lambda _: {"impact": PD, "constant-load": PD})
     monkeypatch.setattr(engines, "PERTURBATIONS", {"late": Perturbations(delay_steps=(1, 1))})
-    arguments = ["--policy", str(policy), "--engines", "mujoco", "--trials", "1", "--perturbed-trials", "1",
-                 "--load-trials", "3", "--episode-seconds", "2", "--timestep", "0.01", "--jobs", "1", "--output",
-                 str(tmp_path)]  # fmt: skip
-    assert script.main(arguments) == 0
-    result = json.loads((tmp_path / "report.json").read_text())
+    cfg = Comparison(("mujoco",), 1, 1, 3, episode_seconds=2.0, timestep=0.01)
+    result = json.loads(json.dumps(compare(policy, cfg, 1, tmp_path)))
     load = result["engines"]["mujoco"]["periodic-load"]["arms"]["right"]
     assert load["elbow_torque_nm"] == pytest.approx(load["elbow_torque_statics_nm"], rel=0.1)
     moved = result["engines"]["mujoco"]["constant-load"]["PD"]["displacement_z"]["mean"]
     assert abs(moved) < 0.1  # how far, and whether at all, is the policy's business: its arms' agent takes up the load
-    assert "| late | 0 of 1" in (tmp_path / "report.md").read_text()
+    assert "| late | 0 of 1" in markdown(result)
+    figure(result, tmp_path / "report.png")
     assert (tmp_path / "report.png").read_bytes().startswith(b"\x89PNG")
     # Again, from what was kept; with another seed, anew.
     monkeypatch.setattr(engines, "loads", None)
-    assert script.main(arguments) == 0
-    assert json.loads((tmp_path / "report.json").read_text())["engines"] == result["engines"]
+    assert json.loads(json.dumps(compare(policy, cfg, 1, tmp_path))) == result
     with pytest.raises(TypeError):
-        script.main([*arguments, "--seed", "1"])
+        compare(policy, replace(cfg, seed=1), 1, tmp_path)
 
 
 def test_parts_are_run_as_they_ask_and_otherwise_as_the_policy_was_trained(policy, policy_file, tmp_path, monkeypatch):
@@ -355,15 +352,18 @@ def test_trials_do_not_depend_on_the_number_of_processes(policy_file):
     assert not np.array_equal(found[0][0].qpos, found[0][1].qpos)
 
 
-def test_bad_comparisons_are_named(policy_file, capsys, tmp_path):
-    for arguments, message in (
-        (["--engines", "newton"], "engine 'newton' is unknown"),
-        (["--trials", "0"], "trials must be a positive integer"),
-        (["--episode-seconds", "1"], "episode_seconds must lie in"),
-        (["--jobs", "-1"], "jobs must lie in"),
-        (["--motion", "moonwalk", "--jobs", "1"], "no clip is called 'moonwalk'"),
-    ):
-        assert script.main(["--policy", str(policy_file), "--output", str(tmp_path), *arguments]) == 2
-        assert message in capsys.readouterr().err
-    with pytest.raises(ValueError, match="at least one engine"):
-        Comparison(engines=()).check()
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [({"engines": ("newton",)}, "engine 'newton' is unknown"), ({"engines": ()}, "at least one engine"),
+     ({"trials": 0}, "trials must be a positive integer"), ({"episode_seconds": 1.0}, "episode_seconds must lie in")],
+)  # fmt: skip
+def test_bad_comparisons_are_named(fields, message):
+    with pytest.raises(ValueError, match=message):
+        Comparison(**fields).check()
+
+
+def test_what_trials_cannot_begin_with_is_named(policy_file, tmp_path):
+    with pytest.raises(ValueError, match="jobs must lie in"):
+        compare(policy_file, Comparison(), -1, tmp_path)
+    with pytest.raises(ValueError, match="no clip is called 'moonwalk'"):
+        compare(policy_file, Comparison(motion="moonwalk"), 1, tmp_path)

@@ -13,7 +13,7 @@ from reports.paper.tables import PAPER_ROBOT
 
 POLICIES = ("cotap", "base", "no-ratio", "torque-critic", "goals", "facet", "seed-0", "seed-1", "seed-2")
 """Names of all policies that a page may measure: two that ship, ablations, and CoTaP trained with three seeds."""
-PAIRED = ("impact", "constant-load", "periodic-load", "velocity-tracking", "tour")
+PAIRED = ("impact", "constant-load", "periodic-load", "velocity-tracking")
 """Protocols that write every env's figures, so that two evaluations are compared env by env."""
 KEPT = (
     "protocol", "method", "num_envs", "num_falls", "window", "fidelity", "num_wrong_way", "num_unholdable",

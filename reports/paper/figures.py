@@ -23,16 +23,6 @@ def plot_curves(path: Path, curves: dict[str, tuple[list[float], list[float]]], 
     _finish(path, figure, axis[0], xlabel=x, ylabel=y)
 
 
-def plot_fall_curves(path: Path, results: dict[str, dict[str, Any]]) -> None:
-    """Shares of falls against impulse, on one axis."""
-    from cotap.evaluation.fall_curve import draw_fall_curve
-
-    figure, axis = _axes(1)
-    for (name, result), color in zip(results.items(), ("#cb181d", "#2171b5"), strict=False):
-        draw_fall_curve(axis[0], result, color, name)
-    _finish(path, figure, axis[0], xlabel="impulse [N s]", ylabel="share of envs that fell", ylim=(-0.02, 1.02))
-
-
 def plot_trade_off(path: Path, points: list[tuple[str, float, float]]) -> None:
     """Error of single hands' felt stiffness [%] against e_upper [rad], by the share of the policy's arm actions."""
     figure, axis = _axes(1)
