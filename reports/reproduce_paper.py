@@ -131,9 +131,22 @@ def begin(book: Book, arguments: Sequence[str]) -> None:
     book.add(f"# {title}" if book.robot == PAPER_ROBOT else f"# {title}, on {book.robot.upper()}")
     book.paragraph(HEAD, command=shlex.join(["python", "-m", "reports.reproduce_paper", *arguments]), envs=book.envs)
     book.paragraph(IMPACT, robot=book.robot.upper())
-    measured = (f"`{name}` ({samples(book, name)} M samples)" for name in book.policies if book.has(name))
+    there = filter(book.has, book.policies)
+    measured = [f"`{name}` ({samples(book, name)} M samples{origin(book, name)})" for name in there]
     book.paragraph("Policies: {measured}.", measured=", ".join(measured) or "none of which there is a checkpoint")
     book.paragraph(ELSEWHERE)
+
+
+def origin(book: Book, name: str) -> str:
+    """What the page has to say of where a policy began: a comparison with the base is with its own, unless the
+    page says otherwise."""
+    from cotap.agents.checkpoint import sha256
+    from cotap.evaluation.policy import find_checkpoint
+
+    began = book.checkpoint(name)["config"].get("base")
+    if not began or not book.has("base") or began["sha256"] == sha256(find_checkpoint(book.policies["base"])):
+        return ""
+    return ", begun from another base"
 
 
 if __name__ == "__main__":

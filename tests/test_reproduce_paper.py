@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from random_policy import save_random_policy
 
-from cotap.agents.checkpoint import sha256
+from cotap.agents.checkpoint import load_checkpoint, save_checkpoint, sha256
 from cotap.evaluate import pictures
 from reports import reproduce_paper as rp
 from reports.compare_laws import Static, Transient
@@ -280,6 +280,18 @@ def test_only_evaluations_of_the_same_policy_and_settings_are_kept(book, monkeyp
         assert (not asked) == kept
     assert str(book.folder) not in json.dumps(book.summary())
     assert book.summary()["rows"]["row"]["arguments"][:3] == ["impact", "--num-envs", "4"]
+
+
+def test_the_page_says_who_began_from_another_base(book, tmp_path):
+    base = save_random_policy(tmp_path / "base.pt")
+    book.policies["base"] = str(base)
+    for name, begun_from in (("cotap", sha256(base)), ("facet", "0" * 64)):
+        path = save_random_policy(tmp_path / f"{name}.pt", "distill")
+        content = load_checkpoint(path)
+        content["config"]["base"] = {"sha256": begun_from, "runs": []}
+        save_checkpoint(path, content)
+        book.policies[name] = str(path)
+    assert [rp.origin(book, name) for name in ("base", "cotap", "facet")] == ["", "", ", begun from another base"]
 
 
 @pytest.fixture
