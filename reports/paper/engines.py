@@ -1,7 +1,6 @@
-"""One policy in several engines: velocity tracking, impact, constant and periodic load, and what robots do wrong.
+"""One policy in several engines: velocity tracking, a periodic load, and what robots do wrong.
 
-The paper's section IV-C, with predictions beside what was measured where statics makes them. Laws and what arms do are
-those of the evaluation's tables.
+The paper's section IV-C, with what statics predicts of the load beside what was measured.
 """
 
 from __future__ import annotations
@@ -28,7 +27,6 @@ from cotap.envs import HumanoidEnvConfig
 from cotap.envs.scripted_forces import ForceProfile
 from cotap.envs.state import StateReader
 from cotap.envs.upper_body import UpperBody, UpperBodyConfig
-from cotap.evaluation.disturbance import ConstantLoad, Impact, window_measures
 from cotap.evaluation.law_options import parse_law
 from cotap.evaluation.metrics import summarize, tracking_measures, wilson_interval
 from cotap.evaluation.periodic import amplitude as swing_amplitude
@@ -38,7 +36,6 @@ from cotap.motions.elbow import elbow_index
 from cotap.motions.reference import HELD, MIXTURE
 from cotap.robots import RobotSpec
 from reports.cells import cell
-from reports.paper.arms import NULL_STIFFNESS, soft_gain
 from reports.paper.book import kept
 from reports.paper.periodic import LEFT
 from reports.paper.workers import Workers
@@ -74,10 +71,10 @@ class Comparison:
     perturbed_trials: int = 100
     """Trials of each perturbation."""
     load_trials: int = 100
-    """Trials of each law under each load."""
+    """Trials under the periodic load."""
     motion: str = MIXTURE
-    """Clip for the arms, `mixture` or `none`. mixture: as in recipes. none: hold the default pose. Under loads that
-    last, arms hold it anyhow."""
+    """Clip for the arms, `mixture` or `none`. mixture: as in recipes. none: hold the default pose. Under the load,
+    arms hold it anyhow."""
     episode_seconds: float = 20.0
     """Length of a trial of velocity tracking or under perturbations [s]."""
     seed: int = 0
@@ -97,7 +94,7 @@ class Comparison:
 
     @property
     def arms(self) -> ArmMotion:
-        """What arms do, but under loads that last."""
+        """What arms do, but under the load."""
         return ArmMotion(clip="" if self.motion == HELD else self.motion)
 
     def engine(self, name: str) -> EngineConfig:
@@ -143,13 +140,9 @@ def compare(path: Path, cfg: Comparison, jobs: int, parts: Path) -> dict[str, An
 def _parts(policy: OnnxPolicy, cfg: Comparison, run: Run) -> dict[str, Callable[[], dict[str, Any]]]:
     """Everything that is run in one engine, by name."""
     spec, trained = robot_of(policy.metadata), law_config(policy.metadata)
-    impact, load = Impact(onset=ONSET_S, episode_seconds=ONSET_S + 2.0), ConstantLoad(onset=ONSET_S)
-    load.episode_seconds = ONSET_S + 4.0
-    walk, laws = Scenario(cfg.episode_seconds, cfg.arms), laws_by_part(policy.metadata.robot)
+    walk = Scenario(cfg.episode_seconds, cfg.arms)
     return {
         "velocity-tracking": lambda: tracking(run(walk, cfg.trials), policy, cfg),
-        "impact": lambda: loads(run, spec, impact, laws["impact"], cfg, trained),
-        "constant-load": lambda: loads(run, spec, load, laws["constant-load"], cfg, trained),
         "periodic-load": lambda: periodic(run, spec, cfg, trained),
         "perturbations": lambda: {
             label: falls(run(walk, cfg.perturbed_trials, wrong=wrong)) for label, wrong in PERTURBATIONS.items()
@@ -168,47 +161,6 @@ def tracking(trials: list[Trial], policy: OnnxPolicy, cfg: Comparison) -> dict[s
     measures = tracking_measures(_trajectory(trials, cfg.episode_seconds), gait_config(policy.metadata).period_s)
     names = ("e_lin", "e_lin_gait", "e_yaw_gait", "e_height", "e_upper", "stand_drift", "swing_height", "stride_rate")
     return falls(trials) | {"metrics": {name: summarize(measures[name], cfg.seed) for name in names}}
-
-
-def laws_by_part(robot: str) -> dict[str, dict[str, str]]:
-    """Laws that impact and constant load compare, by name: those of the paper's Table III and Fig. 4."""
-    struck = {f"K {k}": _cotap(k, k, 300) for k in (100, 500, 800)} | {"alpha 0.7, K 100": _cotap(100, 100, 300, 0.7)}
-    loaded = {f"K_z {k}": _cotap(300, 300, k) for k in (100, 500, 1000)} | {"alpha 0.5": _cotap(300, 300, 100, 0.5)}
-    return {
-        "impact": {"PD": "pd", "soft PD": f"soft-pd:soft_gain={soft_gain(robot):g}", **struck},
-        "constant-load": {"PD": "pd", **loaded},
-    }
-
-
-def _cotap(x: float, y: float, z: float, alpha: float = 1.0) -> str:
-    return f"cotap:stiffness={x}x{y}x{z},null_stiffness={NULL_STIFFNESS},alpha={alpha:g}"
-
-
-def loads(
-    run: Run, spec: RobotSpec, protocol: Impact, laws: dict[str, str], cfg: Comparison, trained: UpperBodyConfig
-) -> dict[str, Any]:
-    """An impact or a held load on the left hand, standing, law by law; all else of the arms is as `trained`."""
-    out: dict[str, Any] = {}
-    force = ForceProfile(protocol.force, protocol.hand, protocol.onset, protocol.duration)
-    arms = cfg.arms if protocol.arms == "moving" else ArmMotion()
-    scenario = Scenario(protocol.seconds, arms, command=STAND, force=(force,))
-    for label, text in laws.items():
-        law = parse_law("left", text, trained.left)
-        trials = run(scenario, cfg.load_trials, replace(trained, left=law, right=replace(law)), APART)
-        t = _trajectory(trials, protocol.seconds)
-        begin, first, last = (round((protocol.onset + s) / t.dt) for s in (0.0, *protocol.window))
-        hit = [i for i, arm in enumerate(spec.arms) if protocol.hand in (arm.side, "both")]
-        measures = window_measures(t, first, last, hit)
-        names = ("e_torso", "e_ee", "e_ee_hit", "j_upper", "e_upper")
-        stood = ~t.fell.any(0)
-        moved = (t.hand_offset[-1] - t.hand_offset[begin - 1])[:, hit, 2].mean(1)
-        curve = t.hand_error[begin - round(0.5 / t.dt) :, stood][:, :, hit].mean((1, 2))
-        out[label] = falls(trials) | {
-            "metrics": {name: summarize(measures[name], cfg.seed) for name in names},
-            "displacement_z": summarize(moved[stood], cfg.seed),
-            "curve": curve.tolist() if stood.any() else [],
-        }
-    return out
 
 
 def periodic(
@@ -291,17 +243,6 @@ def markdown(result: dict[str, Any]) -> str:
     for name in next(iter(engines.values()))["velocity-tracking"]["metrics"]:
         row = [cell(e["velocity-tracking"]["metrics"][name]) for e in engines.values()]
         lines.append(f"| {name} | " + " | ".join(row) + " |")
-    for part, title, arms in (
-        ("impact", "Impact of 500 N for 0.05 s", moving), ("constant-load", "Constant load of -50 N", HELD_ARMS),
-    ):  # fmt: skip
-        lines += ["", f"## {title}, left hand, stance, {arms}", ""]
-        lines += ["| engine | law | fell | e_torso [m/s] | e_ee_hit [m] | j_upper [Nm] | hand z at the end [m] |",
-                  "|---|---|---|---|---|---|---|"]  # fmt: skip
-        for name, e in engines.items():
-            for label, row in e[part].items():
-                m = row["metrics"]
-                shown = " | ".join(cell(m[k]) for k in ("e_torso", "e_ee_hit", "j_upper"))
-                lines.append(f"| {name} | {label} | {_falls(row)} | {shown} | {cell(row['displacement_z'])} |")
     lines += ["", f"## Periodic load of 30 N, 4 s, both hands, {HELD_ARMS}: left alpha 0.7 at 500 N/m, right PD", ""]
     lines += [
         "| engine | arm | elbow torque [Nm] | of it statics | hand swing [m] | of it statics |",
@@ -324,28 +265,22 @@ def _falls(row: dict[str, Any]) -> str:
 
 
 def figure(result: dict[str, Any], path: Path) -> None:
-    """Impact, constant load and periodic load over time, and falls under perturbations, as a picture."""
+    """Torque of both elbows under the periodic load, as a picture."""
     plt = pyplot()
 
     engines = result["engines"]
-    fig, axes = plt.subplots(3, len(engines), figsize=(4.6 * len(engines), 9.0), constrained_layout=True, squeeze=False)
-    for column, (name, e) in zip(axes.T, engines.items(), strict=True):
-        for axis, part in zip(column, ("impact", "constant-load"), strict=False):
-            for label, law in e[part].items():
-                axis.plot(result["dt"] * np.arange(len(law["curve"])) - 0.5, law["curve"], label=label, lw=1.2)
-            axis.set(title=f"{name}, {part}", xlabel="time since the onset [s]", ylabel="error of the hand hit [m]")
-            axis.legend(frameon=False, fontsize=9)
-        p, axis = e["periodic-load"], column[2]
+    fig, axes = plt.subplots(1, len(engines), figsize=(4.6 * len(engines), 3.0), constrained_layout=True, squeeze=False)
+    for axis, (name, e) in zip(axes[0], engines.items(), strict=True):
+        p = e["periodic-load"]
         styles = (("right", "PD", "#d95f02", "-"), ("left", "alpha 0.7, 500 N/m", "#2171b5", "--"))
         for side, law, color, style in styles:  # the second, dashed, lets the first be seen
             torque, statics = p["arms"][side].get("torque", []), p["arms"][side]["elbow_torque_statics_nm"]
             axis.plot(p["time"], torque, style, color=color, lw=1.4, label=f"{side}, {law}")
             for end in (-1.0, 1.0) if torque else ():
                 axis.axhline(np.mean(torque) + end * statics, color="0.4", ls=":", lw=1.0)
-        axis.set(title=f"{name}, periodic load; dotted: statics", xlabel="time [s]", ylabel="elbow torque [Nm]")
+        axis.set(title=f"{name}; dotted: statics", xlabel="time [s]", ylabel="elbow torque [Nm]")
         low, high = axis.get_ylim()
         axis.set_ylim(min(low, -13.0), max(high, 17.0))
         axis.legend(frameon=False, fontsize=9, loc="upper right")
-        for axis in column:
-            axis.grid(alpha=0.2)
+        axis.grid(alpha=0.2)
     save_figure(fig, path)

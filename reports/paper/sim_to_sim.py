@@ -12,11 +12,11 @@ TRIALS, QUICK_TRIALS = 100, 4
 WHAT = """The policy as it is deployed, in one ONNX file, one robot at a time: MuJoCo with physics steps of 1 ms and
 elliptic friction cones, and PyBullet. {trials} trials of each row, of {seconds:g} s under random commands and
 perturbations; in brackets, Wilson's interval of falls and the bootstrap's of measures, over trials that fell too, each
-until then; the hand's height at the end and the periodic load are of trials that stood. {missing}"""
+until then; the periodic load is of trials that stood. {missing}"""
 
 
 def sim_to_sim(book: Book) -> None:
-    """Tracking, pushes, loads and perturbations in several engines."""
+    """Tracking, a load and perturbations in several engines."""
     book.add("", "## Sim to sim (the paper's section IV-C)")
     if not book.has("cotap"):
         book.paragraph(missing("cotap"))
@@ -39,7 +39,7 @@ def sim_to_sim(book: Book) -> None:
     export_policy(find_checkpoint(book.policies["cotap"]), policy, checks=1000)
     result = compare(policy, cfg, book.threads or len(os.sched_getaffinity(0)), parts)
     book.add("", markdown(result).replace("## ", "### ").rstrip())
-    figure(result, book.figure("sim_to_sim", "Error of the hand that is pushed or loaded, and torque of the elbows."))
+    figure(result, book.figure("sim_to_sim", "Torque of the elbows under the periodic load."))
 
 
 def installed(robot: str) -> tuple[tuple[str, ...], str]:
