@@ -9,7 +9,7 @@ import cotap.uncompiled  # noqa: F401 - before what would load the compiler
 import sys
 import time
 from contextlib import nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -114,7 +114,7 @@ def deploy(options: DeployOptions) -> dict[str, Any]:
     for side in ("left", "right"):
         text = getattr(options, side) or getattr(scenario, side)
         if text:
-            setattr(laws, side, parse_law(side, text, replace(laws.of(side))))
+            setattr(laws, side, parse_law(side, text, laws.of(side)))
             laws.modulation.hold()
     for command in scenario.command:
         for note in command.untrained(command_config(policy.metadata)):
@@ -141,7 +141,9 @@ def deploy(options: DeployOptions) -> dict[str, Any]:
     print(summary(result))
     if options.json:
         write_json(Path(options.json), result)
-    if options.video and trials[0].qpos:
+    if options.video and not trials[0].qpos:
+        print(f"{options.video} is not written: the first trial diverged in its first step", file=sys.stderr)
+    elif options.video:
         import numpy as np
         import torch
 

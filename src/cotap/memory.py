@@ -1,4 +1,4 @@
-"""Whether there is memory for what is asked, before it is taken: a system that runs out ends whom it likes, unsaid."""
+"""Checks of free memory before much of it is taken: a system that runs out kills a process without a message."""
 
 from __future__ import annotations
 

@@ -206,7 +206,7 @@ def _train_as_long(args: list[str], options: BaseOptions | DistillOptions, sampl
 
 
 def _unpin_library(args: list[str], training: BaseTraining | DistillTraining) -> None:
-    """Take a motion library that is given as it now is, whatever the config that is gone on from was trained with."""
+    """If a motion library is given, drop the digest that the resumed or base config has: the file is taken as it is."""
     if _peek(args, "--env.motions.clips.library"):
         training.env.motions.clips.library_sha256 = ""
 

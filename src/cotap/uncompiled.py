@@ -1,7 +1,7 @@
-"""Imported first, it spares a command torch's compiler, which takes longer to load than torch itself.
+"""Imported before tensordict, it keeps a command from loading torch's compiler, which takes longer than torch itself.
 
-On import, tensordict informs the compiler about three of its functions, and so loads it. Where nothing is compiled, as
-in the commands, that changes nothing. Without effect where tensordict is there already.
+On import, tensordict registers three of its functions with the compiler, and so loads it. Where nothing is compiled, as
+in the commands, they need not be registered. Without effect where tensordict is imported already.
 """
 
 import torch.compiler

@@ -276,6 +276,8 @@ def test_ended_envs_restart_in_the_next_step_where_that_is_asked_for(robot):
     assert "final_obs" not in own
     assert own["diverged"].tolist() == [False, False]
     assert reward[0] != 0.0
+    with pytest.raises(ValueError, match=r"actions must have shape .*, got \(2,\)"):
+        following.step(np.zeros(2))  # as many as envs, of which one restarts
     actions = zeros(following)
     actions[0] = np.nan  # of an env that restarts no action is asked
     first, reward, termination, truncation, infos = following.step(actions)

@@ -148,6 +148,7 @@ def test_a_law_reads_what_it_is_said_to_read(name, spec, rng):
         (["impact", "--method", "soft-pd", "--null-stiffness", "30"], "--null-stiffness is not read by soft-pd"),
         (["impact", "--method", "facet", "--alpha", "0.5"], "laws that read it: cotap, "),
         (["impact", "--torso-compliance", "constant"], "--torso-compliance is not read by pd"),
+        (["impact", "--method", "facet", "--torso-compliance", "support"], "--torso-compliance is not read by facet"),
         (["impact", "--singularity-ratio", "False"], "--singularity-ratio is not read by pd"),
         (["impact", "--left", "pd", "--right", "facet", "--error", "task"], "--error is not read by facet and pd"),
         (["impact", "--method", "cotap", "--left", "pd", "--right", "hmc"], "--method does nothing beside"),

@@ -157,5 +157,5 @@ def test_weights_may_be_whole_numbers(spec):
 def test_bad_fields_are_named(spec):
     with pytest.raises(ValueError, match="at least one weight of hold, reach, punch, wave, swing"):
         MotionGenerator(MotionConfig(0, 0, 0, 0, 0), spec, 1, 0.02)
-    with pytest.raises(ValueError, match=r"motions\.punch must lie in"):
+    with pytest.raises(ValueError, match=r"motions\.generator\.punch must lie in"):
         MotionGenerator(MotionConfig(punch=-0.1), spec, 1, 0.02)

@@ -35,9 +35,9 @@ class DualPPOConfig:
     initial_std: float = 0.6
     """Standard deviation of actions at the start."""
     std_half_life: float = 150e6
-    """Samples in which it falls by half; 0 to learn it instead."""
+    """Samples in which the standard deviation of actions halves; 0 to learn it instead."""
     least_std: float = 0.12
-    """Where that fall ends."""
+    """Lower bound of the standard deviation while it follows `std_half_life`."""
     steps: int = 24
     """Steps per env and iteration."""
     epochs: int = 3
@@ -53,17 +53,17 @@ class DualPPOConfig:
     clip: float = 0.2
     """Clip range of the surrogate."""
     value_clip: float = 0.0
-    """Values are learnt no further than this from what they were when the rollout began; 0 for any distance."""
+    """Clip range of the value loss: how far values may move from those of the rollout; 0 for no clipping."""
     entropy: float = 0.003
     """Weight of the entropy bonus."""
     value: float = 1.0
     """Weight of the value loss."""
     learning_rate: float = 1e-3
-    """At the start; then adapted to `desired_kl`, per agent."""
+    """Learning rate at the start; it is then adapted to `desired_kl`, per agent."""
     desired_kl: float = 0.01
-    """Change of the policy per update that the learning rate aims at, at the start [nat]."""
+    """KL divergence of an update that the learning rate aims at, at the start [nat]."""
     kl_half_life: float = 150e6
-    """Samples in which that change falls by half: large steps first, later what gradients agree on."""
+    """Samples in which `desired_kl` halves: large updates first, later only what gradients agree on."""
     max_grad_norm: float = 1.0
     """Gradient norm above which gradients are scaled down, per network."""
     precision: str = "auto"
@@ -95,7 +95,11 @@ class DualPPOConfig:
 
 @dataclass
 class Rollout:
-    """What one iteration collects: T steps, N envs, G agents. Observations are stored as the networks read them."""
+    """What one iteration collects: T steps, N envs, G agents, A actions.
+
+    Observations (T, N, width of the group) are stored as the networks read them. `actions`, `means` and `guide_means`
+    are (T, N, A), `dones` (T, N, 1), all others (T, N, G).
+    """
 
     observations: Observations
     actions: torch.Tensor
@@ -309,12 +313,12 @@ class DualPPO:
         own = [*model.actors[name].parameters(), log_std, *model.critics[name].parameters()]
         self._kl.grad = kl.reshape(1)  # travels with the gradients: one message instead of two
         self.ranks.average_gradients([*own, self._kl])
-        desired_kl = cfg.desired_kl * 0.5 ** (self.samples / cfg.kl_half_life)
-        self.learning_rates[name] = adapt_learning_rate(self.learning_rates[name], float(self._kl.grad), desired_kl)
         norm = nn.utils.clip_grad_norm_([*model.actors[name].parameters(), log_std], cfg.max_grad_norm)
         norm += nn.utils.clip_grad_norm_(model.critics[name].parameters(), cfg.max_grad_norm)
         if not torch.isfinite(norm):
             return None
+        desired_kl = cfg.desired_kl * 0.5 ** (self.samples / cfg.kl_half_life)
+        self.learning_rates[name] = adapt_learning_rate(self.learning_rates[name], float(self._kl.grad), desired_kl)
         for group in optimizer.param_groups:
             group["lr"] = self.learning_rates[name]
         optimizer.step()

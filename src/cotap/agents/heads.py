@@ -32,7 +32,7 @@ class Head(nn.Module):
             return self.mlp[-1](x.float())
 
     def answer_zero(self) -> None:
-        """From now on, answer zero to every input; what is learned starts from there."""
+        """Set the output layer to zero: until it is trained, the output is zero for every input."""
         last = cast(nn.Linear, self.mlp[-1])
         nn.init.zeros_(last.weight)
         nn.init.zeros_(last.bias)
@@ -90,7 +90,7 @@ class SymmetricHead(nn.Module):
             return functional.linear(x.float(), torch.cat((weight, image), 1), bias)
 
     def answer_zero(self) -> None:
-        """From now on, answer zero to every input; what is learned starts from there."""
+        """Set the output layer to zero: until it is trained, the output is zero for every input."""
         nn.init.zeros_(self.output_weight)
         nn.init.zeros_(self.output_bias)
 

@@ -1,4 +1,4 @@
-"""Many processes that learn as one: who each is among them, and what they tell each other."""
+"""Distributed training with `torchrun`: the rank of this process, and what ranks exchange."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _BUCKET_MB = 32.0
 
 @dataclass(frozen=True)
 class Ranks:
-    """This process among all that `torchrun` started; a process by itself is rank 0 of 1, and tells nobody anything.
+    """The rank of this process among all that `torchrun` started; a single process is rank 0 of 1, without exchange.
 
     Every rank has envs and random numbers of its own; networks, optimisers and normalisers are the same everywhere.
     """

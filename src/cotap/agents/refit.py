@@ -38,8 +38,8 @@ def columns(layout: dict[str, Any]) -> Columns:
 def take_over(
     path: str, content: dict[str, Any], model: DualActorCritic, env: Any, other: Collection[str] = ()
 ) -> bool:
-    """Give `model` the weights of a checkpoint, refitted if its layout is another in what `other`, a part of
-    `REFITTED`, names. Returns whether they were.
+    """Give `model` the weights of a checkpoint. They are refitted if its layout differs in an entry that `other` names,
+    which is a part of `REFITTED`. Returns whether they were refitted.
 
     Raises:
         CheckpointError: it was trained for something else.

@@ -1,4 +1,4 @@
-"""A run's curves as TensorBoard reads them, and what it says: whole to the last iteration, and no reason to end it."""
+"""TensorBoard records and messages of a run: each is written at once, and a write that fails does not end the run."""
 
 from __future__ import annotations
 

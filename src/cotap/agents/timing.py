@@ -17,10 +17,10 @@ class TimedTraining:
     """Training without a run: nothing is logged or saved.
 
     Args:
-        env: Whose robots learn.
-        ppo: How.
+        env: The environment.
+        ppo: Hyperparameters.
         device: Where the networks live.
-        guide: As in a distillation.
+        guide: A frozen policy to stay close to, as in a distillation; None for none.
     """
 
     def __init__(self, env: VecEnv, ppo: DualPPOConfig, device: str = "cpu", guide: Guide | None = None) -> None:

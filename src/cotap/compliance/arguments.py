@@ -38,9 +38,9 @@ def values_are_known() -> bool:
 def rounding(size: int, dtype: torch.dtype) -> float:
     """Share of its largest eigenvalue up to which an eigenvalue of a size x size matrix counts as zero: `4 size eps`.
 
-    The library's one rule for what is singular; singular values of a Jacobian of so many rows obey it, too. Entries
-    that are rounded to `dtype` make less than a quarter of it of a zero. Since all is computed in float64, the order of
-    rows has no say.
+    It is the library's one rule for what is singular, also for singular values of a Jacobian of `size` rows. Rounding
+    of the entries to `dtype` turns an eigenvalue of zero into less than a quarter of it. Since all is computed in
+    float64, the order of rows does not matter.
     """
     return 4.0 * size * torch.finfo(dtype).eps
 

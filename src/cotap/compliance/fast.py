@@ -34,12 +34,12 @@ class ArmStiffness:
     stiffness: torch.Tensor
     """(..., n, n) the blend K [Nm/rad]."""
     pseudo_inverse: torch.Tensor
-    """(..., n, 3) J#, damped near rank loss unless the threshold is infinite; of all that reach the hand's target,
-    what the PD gains resist least."""
+    """(..., n, 3) J# [rad/m]: of all joint motions that move the hand as asked, the one that the PD gains resist least.
+    Damped near rank loss unless the threshold is infinite."""
     null_projector: torch.Tensor
     """(..., n, n) I - J# J."""
     ratio: torch.Tensor
-    """(...) alpha after the singularity."""
+    """(...) alpha times `singularity`: the exponent a of the blend."""
     singularity: torch.Tensor
     """(...) 1 / (1 + max(0, cond(J) - threshold))."""
     eigenvalue_range: torch.Tensor

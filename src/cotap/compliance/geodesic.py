@@ -18,10 +18,9 @@ from cotap.compliance.arguments import symmetric_part, values_are_known
 from cotap.compliance.spd import log_from_eigenvectors
 
 _ITERATIONS = 24
-"""At most, of the search for a share. Each goes down by one over the largest rate, or more, and squares what is left
-once it is small."""
+"""Most Newton steps of the search for a share. They converge quadratically."""
 _CLOSE = 1e-12
-"""Step of that search which ends it, if no arm's is larger. Mostly the fifth."""
+"""The search ends with the first step, mostly the fifth, that lowers no arm's share by more than this."""
 
 
 class HeldStiffness(NamedTuple):

@@ -63,7 +63,7 @@ class LawConfig:
     passive: bool = False
     """Hold back changes of stiffness that would give away more energy than a store has (cotap)."""
     store_energy: float = 2.0
-    """What that store holds at most, and at first [J]."""
+    """Capacity and initial level of the energy store of a `passive` law [J] (cotap)."""
     store_power: float = 10.0
     """Most that changes of stiffness may inject per time [W]."""
 

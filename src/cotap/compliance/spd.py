@@ -84,7 +84,7 @@ def _last_log_derivative(values: torch.Tensor, vectors: torch.Tensor, direction:
     return vectors @ (slope * (vectors.transpose(-1, -2) @ direction @ vectors)) @ vectors.transpose(-1, -2)
 
 
-# Were the compiler to look inside, second derivatives would be zero. To tell it so loads it, about a second of import.
+# If the compiler traced into it, second derivatives would be zero. The decorator imports the compiler: about a second.
 @torch.compiler.allow_in_graph
 def log_from_eigenvectors(matrix: torch.Tensor, values: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
     """Logarithm (..., n, n) of `matrix`, whose eigenvalues (..., n) and eigenvectors (..., n, n) are known."""

@@ -85,8 +85,8 @@ def _after_base(training: DistillTraining) -> None:
     env = training.env
     env.assist, env.curriculum = AssistConfig(), CurriculumConfig()
     env.forces.pushes.ramp, env.forces.hand_loads.ramp = RampConfig(), RampConfig()
-    # What begins anew explores as widely as a base does at first, all else half as widely: by where a base ends, little
-    # was learned any more.
+    # Actions that begin anew explore as widely as a base's do at first, all others half as widely: with the narrow
+    # exploration at which a base ends, little more was learned.
     training.ppo.initial_std = 0.5 * training.distillation.new_std
 
 

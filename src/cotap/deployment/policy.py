@@ -54,8 +54,8 @@ class OnnxPolicy:
         options.add_session_config_entry("session.load_model_format", "ONNX")  # not onnxruntime's own
         try:
             require_plain_graph(data)
-            # As a rule what is constant is worked out while loading, which nothing could end: not before that is known
-            # to take no longer than an inference may.
+            # Constant folding happens while loading and cannot be interrupted: it stays off until a first inference
+            # has shown that the graph is fast enough.
             self._session = onnxruntime.InferenceSession(
                 data, options, providers=["CPUExecutionProvider"], disabled_optimizers=["ConstantFolding"]
             )

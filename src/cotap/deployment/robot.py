@@ -22,7 +22,7 @@ START_LIFT_M = 0.01
 
 @dataclass
 class Perturbations:
-    """What robots do. Drawn anew for every trial."""
+    """Errors of timing, sensors, masses and first pose, as real robots have them. Drawn anew for every trial."""
 
     delay_steps: tuple[int, int] = (0, 0)
     """Least and most control steps that laws are late."""

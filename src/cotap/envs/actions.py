@@ -17,11 +17,11 @@ class ActionConfig:
     """How actions become joint targets."""
 
     lower_scale: float = 0.6
-    """Radians per unit of lower action, added to the default pose. A joint whose stiffness reaches its torque limit
-    before a radian has that share of it."""
+    """Radians per unit of lower action, added to the default pose. For a joint whose PD torque reaches its limit at
+    an error below 1 rad, it is multiplied by that error."""
     waist_share: float = 1.0
-    """Share of that for joints between the base and the torso. They turn the torso itself, whose rates are observed
-    and rewarded: by equal random actions a standing G1's waist turns it faster than its legs do."""
+    """Factor on `lower_scale` for joints between the base and the torso. They turn the torso itself, whose rates are
+    observed and rewarded: equal random actions turn a standing G1's torso faster at the waist than at the legs."""
     upper_scale: float = 0.1
     """Radians per unit of upper action."""
     upper_mode: str = "residual"
@@ -45,8 +45,8 @@ class JointTargets:
     Args:
         cfg: Of actions.
         spec: The robot's.
-        modulated: Whether the upper agent sets the arms' laws. Targets are the reference then: they could give way as
-            laws do, and what either is worth could not be seen.
+        modulated: Whether the upper agent sets the arms' laws. Arm targets are then the reference itself: if they could
+            yield as laws do, the effect of one could not be told from that of the other.
     """
 
     def __init__(self, cfg: ActionConfig, spec: RobotSpec, modulated: bool = False) -> None:

@@ -79,7 +79,7 @@ class Actuation(Stateful):
         return ((substep + 1) * self._physics_dt - self.delay_s).div_(self._physics_dt).clamp_(0.0, 1.0)
 
     def drive(self, substep: int) -> torch.Tensor:
-        """What actuators are given (N, J) in physics step number `substep` of the control step."""
+        """`ctrl` (N, J) [Nm] in physics step `substep`: `kp target`, for arms under laws torque plus `kd dq`."""
         arrived = self.arrived(substep)
         control = self._kp * torch.lerp(self.previous, self.current, arrived.unsqueeze(1))
         if self.upper_body.active:

@@ -24,8 +24,8 @@ class CommandConfig:
     yaw_rate: tuple[float, float] = (-0.9, 0.9)
     """Turning rate, positive to the left [rad/s]."""
     height_offset: tuple[float, float] = (-0.22, 0.02)
-    """Torso height relative to nominal while standing [m]. It is approached at once, so that a
-    robot that walked steps on the spot while it goes down; one that walks again comes up as it sets out."""
+    """Torso height relative to nominal while standing [m]. It is approached at once: a robot that stops goes down
+    while it still steps on the spot, and one that starts to walk comes up as it does."""
     stand_probability: float = 0.25
     """Share of commands that ask the robot to stand."""
     axis_zero_probability: float = 0.2

@@ -23,11 +23,11 @@ class RampConfig:
     """A share that grows linearly from `first` to 1 with the samples (control steps of all envs)."""
 
     start_samples: float = 0.0
-    """Samples up to which it is `first`."""
+    """Samples up to which the share is `first`."""
     full_samples: float = 0.0
-    """Samples from which it is 1."""
+    """Samples from which the share is 1."""
     first: float = 0.0
-    """Where it begins."""
+    """Share at the start."""
 
     def check(self, where: str) -> None:
         """Raise ValueError naming the first field, under `where`, that is out of its range."""
@@ -113,7 +113,7 @@ class AssistConfig:
     upright_stiffness: float = 0.8
     """Righting torque per radian of tilt, over weight times nominal height [1/rad]."""
     upright_damping: float = 0.08
-    """The same per rad/s [s/rad]."""
+    """Righting torque per rad/s of tilt rate, over weight times nominal height [s/rad]."""
     yaw_gain: float = 0.06
     """Turning torque per rad/s that the yaw rate is off its command, over weight times nominal height [s/rad]."""
     velocity_gain: float = 0.6
@@ -139,8 +139,8 @@ class AssistConfig:
 
 
 _DAMPING_SHARE = 1.5
-"""Of the torso's inertia over the control step. A damper that is set once a step makes what it damps sway ever more
-from 2 on; the H1's are below this."""
+"""Largest damping times the control step, over the torso's inertia. A damping torque that is held for a step amplifies
+the motion from 2 on. The H1's gains stay below this."""
 
 
 class AssistWrench:

@@ -108,9 +108,9 @@ class HumanoidVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return self.envs.get_observations()["policy"].cpu().numpy().copy(), {}
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Advance by one control step. Raises ValueError if actions (N, J) have another shape or are not finite."""
+        """Advance by one control step. Raises ValueError if actions (N, A) have another shape or are not finite."""
         sent, waiting = torch.as_tensor(np.asarray(actions, dtype=np.float32), device=self.envs.device), self._ended
-        if waiting.any() and len(sent) == self.num_envs:
+        if waiting.any() and sent.shape == (self.num_envs, self.envs.num_actions):
             sent = torch.where(waiting.unsqueeze(1), torch.zeros_like(sent), sent)
         observations, rewards, done, extras = self.envs.step(sent)
         seen, done = observations["policy"], done & ~waiting

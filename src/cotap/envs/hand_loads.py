@@ -20,11 +20,11 @@ class HandLoadConfig:
     episode_share: float = 0.5
     """Share of the episodes in which hands are loaded."""
     force_x: tuple[float, float] = (-40.0, 40.0)
-    """[N]."""
+    """Forward force on a hand [N]."""
     force_y: tuple[float, float] = (-40.0, 40.0)
-    """[N]."""
+    """Leftward force on a hand [N]."""
     force_z: tuple[float, float] = (-50.0, 5.0)
-    """[N]."""
+    """Upward force on a hand [N]."""
     zero_probability: float = 0.25
     """Chance of each axis of each hand to be free."""
     hold_s: tuple[float, float] = (3.0, 5.0)
@@ -97,8 +97,9 @@ class HandLoads(Stateful):
         return force * holdable.unsqueeze(-1)
 
     def ahead(self, samples: float) -> torch.Tensor:
-        """What critics see of the coming change: how near it is (1 as it comes, 1/e a second before; 0 where there are
-        no loads), and by as much the forces then, as drawn, in the heading frame [N]; (N, 1 + 3 hands)."""
+        """What critics see of the coming change, (N, 1 + 3 hands): its nearness (1 as it comes, 1/e a second before; 0
+        where there are no loads), and, times that nearness, the forces then in the heading frame [N], before torque
+        limits scale them down."""
         near = (self._loaded * (-self._remaining_s).exp()).unsqueeze(1)
         coming = self.cfg.ramp.share(samples) * self._coming_h.flatten(1)
         return float(self.cfg.enabled) * near * torch.cat((torch.ones_like(near), coming), 1)

@@ -16,7 +16,7 @@ from cotap.compliance.laws import LawConfig, reads
 from cotap.envs.observations import Term
 
 PER_ARM = {"none": 0, "alpha": 1, "stiffness": 4}
-"""Actions that each arm has more: for alpha, and for stiffness along x, y and z."""
+"""Actions per arm, in addition to its joints': for alpha, and for stiffness along x, y and z."""
 OBSERVED_STIFFNESS = 300.0
 """Stiffness whose logarithm is observed as zero [N/m]."""
 

@@ -131,9 +131,9 @@ class Pushes(Stateful):
         return self.force_w * (self._left_s / self._dt).clamp(0.0, 1.0).unsqueeze(1)
 
     def ahead(self, heading_w: torch.Tensor, samples: float) -> torch.Tensor:
-        """What critics see of the push that is on, or else of the one that comes: how near it is (1 as it begins, 1/e
-        a second before), and by as much its velocity (3) in the heading frame [m/s] and whether it is on the base, on
-        each hand, or on a link; (N, 6 + hands)."""
+        """What critics see of the present push, or else of the next, (N, 6 + hands): its nearness (1 once it begins,
+        1/e a second before), and, times that nearness, the velocity (3) that it has yet to give in the heading frame
+        [m/s] and, one-hot, whether it is on the base, on each hand, or on a link."""
         on = self._left_s > 0.0
         left_w = self.force_w * (self._left_s / self._mass).unsqueeze(1)
         velocity_w = torch.where(on.unsqueeze(1), left_w, self.cfg.ramp.share(samples) * self._coming_w)

@@ -127,8 +127,8 @@ def _velocity_error(s: StepRecord) -> torch.Tensor:
 
 
 def _on_course(s: StepRecord) -> torch.Tensor:
-    """One at the commanded velocity, none far off. A robot that is pushed needs steps that no phase has. Of those that
-    were paid for the phase all the same, some stood on one leg, as it asked, and fell over it."""
+    """1 at the commanded velocity, towards 0 far off it. It scales the terms of the gait's phase: a pushed robot needs
+    steps that no phase has, and some that were rewarded for the phase regardless stood on one leg and fell."""
     return torch.exp(-_velocity_error(s) / 0.25)
 
 
@@ -184,9 +184,9 @@ class LowerRewards:
 
     @term(10.0)
     def track_mean_velocity(s: StepRecord) -> torch.Tensor:
-        """Velocity averaged over a stride, so that swaying is no reason to walk too slowly: one at its command, none at
-        0.5 m/s off, forward and leftward errors added up. Linear: a kernel is flat for the slow walk that robots begin
-        with, and a norm for the smaller of two errors."""
+        """Velocity averaged over a stride, so that sway costs nothing: 1 at its command, 0 where forward and leftward
+        errors add up to 0.5 m/s. Linear: an exponential kernel is flat at the slow walk that training begins with, and
+        a norm is flat in the smaller of the two errors."""
         return _linear(s.mean_error[:, :2].abs().sum(1), 0.5)
 
     @term(8.0)
@@ -213,8 +213,8 @@ class LowerRewards:
 
     @term(0.75)
     def capture_point(s: StepRecord) -> torch.Tensor:
-        """While standing, closeness of the capture point, where the torso is heading to, to where it stands by default
-        over the middle of the feet."""
+        """While standing, closeness of the torso's capture point to the middle of the feet, less the distance by which
+        the default pose has the torso ahead of it."""
         ahead_h = s.scales.falling_time_s * s.state.torso_linear_velocity_h
         ahead_h = torch.cat((ahead_h[:, :1] - s.scales.torso_ahead_m, ahead_h[:, 1:]), 1)
         point = (s.state.torso_pos_w + rotate(s.state.heading_w, ahead_h))[:, :2]
@@ -234,8 +234,8 @@ class LowerRewards:
 
     @term(-0.3)
     def roll_pitch_rate(s: StepRecord) -> torch.Tensor:
-        """Squared angular velocity of the torso about its horizontal axes, each up to 20 rad/s, for the same
-        reason."""
+        """Squared angular velocity of the torso about its x and y axes, each up to 20 rad/s: one robot whose
+        simulation diverges would outweigh all others."""
         return s.state.torso_angular_velocity_t[:, :2].clamp(-20.0, 20.0).square().sum(1)
 
     @term(5.0)
@@ -324,19 +324,20 @@ class UpperRewards:
 
     @term(3.0)
     def track_arms(s: StepRecord) -> torch.Tensor:
-        """Joint angles of arms that are asked to be at their reference, against it."""
+        """Closeness of joint angles to their reference, of arms under no force, or whose law commands no stiffness."""
         error = s.state.joint_pos[:, _upper(s)] - s.reference.position
         arms = s.tracking_arms
         return torch.exp(-(error.square().unflatten(1, (arms.shape[1], -1)).sum(2) * arms).sum(1) / 0.06)
 
     @term(1.0)
     def track_key_points(s: StepRecord) -> torch.Tensor:
-        """The same of their hands and elbows, carried in the torso frame (paper, appendices A and B)."""
+        """Closeness of hands and elbows to their reference, torso frame, of the same arms (appendices A and B)."""
         return torch.exp(-_of_tracking_arms(s, s.key_points_t - s.key_points_reference_t) / 0.01)
 
     @term(0.3)
     def track_key_velocities(s: StepRecord) -> torch.Tensor:
-        """The same of their velocities in the world, the reference's carried by the torso (appendix A)."""
+        """Closeness of the velocities of hands and elbows in the world to those of their reference, which the torso
+        carries, over the arms of `track_arms` (paper, appendix A)."""
         spin = s.state.torso_angular_velocity_t.unsqueeze(1)
         offset = s.key_points_t - s.key_points_reference_t
         error = s.key_velocities_t - s.key_velocities_reference_t + torch.linalg.cross(spin.expand_as(offset), offset)
@@ -370,7 +371,7 @@ class UpperRewards:
 
     @term(0.0)
     def loaded_hand_error(s: StepRecord) -> torch.Tensor:
-        """The same of hands under a load, and no push [m]."""
+        """Distance from the reference of hands under a load and no push, mean over all hands [m]."""
         return (_hand_offset(s).norm(dim=2) * s.loaded_hands).mean(1)
 
     @term(0.0)
@@ -394,8 +395,7 @@ class UpperRewards:
 
     @term(-0.02)
     def upper_action_rate(s: StepRecord) -> torch.Tensor:
-        """Squared change of the arm joints' actions. Those that set laws have rates of their own: noise beyond their
-        bounds is cut off, so that a penalty would drive them there."""
+        """Squared change of the arm joints' actions. A penalty on actions for laws would drive them to their bounds."""
         return (s.action - s.last_action)[:, s.scales.num_lower : s.torque.shape[1]].square().sum(1)
 
     @term(-5.0)

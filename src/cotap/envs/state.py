@@ -64,7 +64,7 @@ class RobotState:
 
     @property
     def height(self) -> torch.Tensor:
-        """(N,) height of the torso link's origin above the ground [m]."""
+        """(N,) height of the torso link's origin above z = 0 [m]: the ground if flat, else halfway up its bumps."""
         return self.torso_pos_w[:, 2]
 
     @property

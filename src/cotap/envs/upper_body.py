@@ -49,11 +49,11 @@ class LawSampling:
     log_uniform: bool = True
     """Draw the logarithm of stiffness uniformly, or else (the paper) stiffness itself."""
     null_stiffness: tuple[float, float] = (24.0, 56.0)
-    """Uniform [Nm/rad]."""
+    """Null-space stiffness, uniform [Nm/rad]."""
     alpha: tuple[float, float] = (0.0, 1.0)
-    """Uniform."""
+    """Share of compliance in the blend with PD, uniform."""
     full_alpha: float = 0.0
-    """Share of the draws that take the largest alpha instead: what a rollout of compliance alone meets all the time."""
+    """Share of the draws that take the largest alpha instead, as evaluations of compliance alone do."""
     hold_s: tuple[float, float] = (2.0, 6.0)
     """Time between changes [s]."""
 
@@ -95,8 +95,8 @@ class UpperBodyConfig:
         return {"left": self.left, "right": self.right}[side]
 
     def built(self, law: LawConfig) -> LawConfig:
-        """`law` as it is built here: without the ratio, no arm is near enough to singular to give way, or to be damped
-        there, but for hands whose orientation has a stiffness, too."""
+        """`law`, with an infinite condition threshold if `singularity_ratio` is off: alpha is kept near singular arms,
+        and pseudo-inverses are not damped there, except under a `rotational_stiffness`."""
         return law if self.singularity_ratio else replace(law, condition_threshold=math.inf)
 
 

@@ -143,7 +143,7 @@ def measure(env: HumanoidEnv, protocol: Fidelity, policy: PolicyFunction) -> tup
     direction = torch.nn.functional.one_hot(axis, 3) * (2.0 * torch.randint(0, 2, (len(axis), 1), generator=rng) - 1.0)
     force_h = stiffness.unsqueeze(1) * protocol.displacement * direction
     env.upper_body.parameters.stiffness[:] = stiffness[:, None, None].to(env.device)
-    side = protocol.load(env, force_h)
+    protocol.load(env, force_h)
     env.motions.hold(pose)
     unholdable = _torque_share(env, pose, side, force_h) > HOLDABLE
     settled = settle(env, acting(env, policy, protocol.upper_actions), protocol.settle_seconds, side)

@@ -11,8 +11,8 @@ from cotap.compliance.laws import LAWS, READS, LawConfig, reads
 from cotap.envs.upper_body import LawSampling, UpperBodyConfig
 
 SIDES = ("left", "right")
-OF_ALL_ARMS = {"torso_compliance": "stiffness", "singularity_ratio": "condition_threshold"}
-"""Options that CoTaP's laws alone read, though they are of no single arm, with a field that they come with."""
+OF_ALL_ARMS = {"torso_compliance": "condition_threshold", "singularity_ratio": "condition_threshold"}
+"""Options of both arms at once, each with the field of `LawConfig` by which it is decided which laws read it."""
 
 
 @dataclass

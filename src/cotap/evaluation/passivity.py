@@ -150,7 +150,7 @@ class Passivity(Stance):
         self.group = number.to(env.device)
         """(N,) law and command of each env: `law + len(compared) * command`."""
         for i, group in enumerate(number.tolist()):
-            law = parse_law("compared", self.compared[group % len(self.compared)], replace(arms.left))
+            law = parse_law("compared", self.compared[group % len(self.compared)], arms.left)
             for arm in range(len(env.spec.arms)):
                 env.set_law(i, arm, law)
 

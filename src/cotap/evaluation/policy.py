@@ -165,7 +165,7 @@ def _require_fitting(networks: AgentLayout, layout: dict[str, Any]) -> None:
 
 def _env_config_of(path: Path | str, content: dict[str, Any]) -> HumanoidEnvConfig:
     try:
-        env, _ = without_unknown_terms(content["config"]["training"]["env"])  # here nobody is paid
+        env, _ = without_unknown_terms(content["config"]["training"]["env"])  # evaluations use no reward weights
         cfg = from_plain(HumanoidEnvConfig, env)
         cfg.backend = "auto"  # the one it was trained on may not be installed here
         cfg.check()

@@ -21,8 +21,8 @@ from cotap.evaluation.undisturbed import disable_disturbances
 from cotap.motions.reference import HELD, MIXTURE, ClipConfig
 
 FIRST_SEED = 2**31
-"""Of an evaluation's envs, where its seed is 0: masses are drawn once, and from a training's seed they would be those
-that the policy knows. Generators of random numbers read the lowest 32 bits of a seed alone."""
+"""Seed of an evaluation's envs where --seed is 0. Masses are drawn once: with the seed of the training they would be
+those that the policy knows. Random number generators read only the lowest 32 bits of a seed."""
 
 
 @dataclass

@@ -23,7 +23,7 @@ from cotap.robots import RobotSpec
 from cotap.robots.chains import arm_model
 
 NOTHING_J = 1e-3
-"""Energy that a trial may lack before it counts as drawn: what rounding and sampling make of none."""
+"""Energy up to which none counts as drawn [J]: the error of rounding and sampling."""
 _CHUNK = 1000
 
 

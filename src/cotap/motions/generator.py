@@ -44,13 +44,15 @@ class MotionConfig:
     def check(self) -> None:
         """Raise ValueError naming the first field that is out of its range."""
         for kind in KINDS:
-            require_range(f"motions.{kind}", getattr(self, kind), 0.0, math.inf)
+            require_range(f"motions.generator.{kind}", getattr(self, kind), 0.0, math.inf)
         if sum(getattr(self, kind) for kind in KINDS) <= 0.0:
-            raise ValueError(f"motions: at least one weight of {', '.join(KINDS)} must be positive, got all 0")
-        require_range("motions.velocity_share", self.velocity_share, 0.01, 1.0)
-        require_range("motions.largest_speed", self.largest_speed, 0.1, 1e3)
-        require_range("motions.limit_margin_rad", self.limit_margin_rad, 0.0, 1.0)
-        require_range("motions.range_rad", self.range_rad, 0.0, math.pi)
+            raise ValueError(
+                f"motions.generator: at least one weight of {', '.join(KINDS)} must be positive, got all 0"
+            )
+        require_range("motions.generator.velocity_share", self.velocity_share, 0.01, 1.0)
+        require_range("motions.generator.largest_speed", self.largest_speed, 0.1, 1e3)
+        require_range("motions.generator.limit_margin_rad", self.limit_margin_rad, 0.0, 1.0)
+        require_range("motions.generator.range_rad", self.range_rad, 0.0, math.pi)
 
 
 @dataclass(frozen=True)
@@ -151,7 +153,7 @@ class MotionGenerator(Stateful):
         )
         goal = start + (goal - start) * torch.where(single > 0.5, own, torch.ones_like(own))
         amplitude = self._oscillation(start, is_kind, rng)
-        fastest = torch.maximum((goal - start).abs() / self._speed, torch.zeros_like(goal)).amax(1) * PEAK_SPEED
+        fastest = ((goal - start).abs() / self._speed).amax(1) * PEAK_SPEED
         legs = 1.0 + is_kind["punch"].squeeze(1)
         slack = torch.where(is_kind["punch"].squeeze(1) > 0.5, uniform(rng, 1.0, 1.8, n), uniform(rng, 1.3, 5.0, n))
         duration = (fastest * legs * slack).clamp_min(0.5)

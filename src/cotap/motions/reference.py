@@ -45,7 +45,7 @@ class ClipConfig:
     velocity_share: float = 0.5
     """Fastest playing, as a share of each joint's velocity limit; faster passages are slowed down."""
     acceleration: float = 40.0
-    """Largest joint acceleration in playing [rad/s^2]; the same."""
+    """Largest joint acceleration in playing [rad/s^2]; passages beyond it are slowed down."""
     hold_s: tuple[float, float] = (4.0, 10.0)
     """Time before another motion is drawn [s]."""
     blend_s: float = 0.3

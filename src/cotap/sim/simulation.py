@@ -42,7 +42,7 @@ class Simulation(ABC):
     After `reset`, all are current.
 
     Args:
-        model: Compiled model; copied.
+        model: Compiled model; kept as `model`, and not to be changed afterwards.
         num_envs: Number of envs.
         substeps: Physics steps per control step.
     """
