@@ -114,7 +114,7 @@ def train_both(options: PipelineOptions, run_stage: RunStage) -> Path:
         raise ValueError("several processes train stage by stage: cotap train base, then distill")
     run_dir = Path(options.run_dir or time.strftime("runs/cotap-%Y%m%d-%H%M%S"))
     if options.resume:
-        options = _gone_on_with(options, run_dir)
+        options = _resumed_options(options, run_dir)
     else:
         _require_unused(run_dir, "go on with --resume, or choose another --run-dir")
         print(expected(options), flush=True)
@@ -136,7 +136,7 @@ def _require_unused(run_dir: Path, advice: str) -> None:
         raise ValueError(f"run directory {str(run_dir)!r} already holds {str(found.relative_to(run_dir))!r}: {advice}")
 
 
-def _gone_on_with(options: PipelineOptions, run_dir: Path) -> PipelineOptions:
+def _resumed_options(options: PipelineOptions, run_dir: Path) -> PipelineOptions:
     """The options that the pipeline in a folder began with, but for those of `MAY_CHANGE` that are given now; these
     options where nothing began there yet.
 

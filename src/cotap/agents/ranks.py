@@ -85,10 +85,10 @@ class Ranks:
         # the group, and abort the process when Python ends.
         import torch.distributed.nn.functional
 
-        on_cards = torch.device(device).type == "cuda"
-        if on_cards:
+        on_gpus = torch.device(device).type == "cuda"
+        if on_gpus:
             torch.cuda.set_device(self.local_rank)
-        backend = "cpu:gloo,cuda:nccl" if on_cards else "gloo"
+        backend = "cpu:gloo,cuda:nccl" if on_gpus else "gloo"
         timeout = timedelta(seconds=TIMEOUT_S)
         dist.init_process_group(backend, rank=self.rank, world_size=self.size, timeout=timeout)
         try:

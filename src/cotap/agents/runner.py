@@ -41,15 +41,15 @@ CHECKPOINT_PATTERN = "checkpoint_*.pt"
 
 def checkpoints_of(run_dir: Path) -> list[Path]:
     """A run's checkpoints, oldest first; from a million iterations on, their names are longer."""
-    return sorted(run_dir.glob(CHECKPOINT_PATTERN), key=_age)
+    return sorted(run_dir.glob(CHECKPOINT_PATTERN), key=_iteration_key)
 
 
 def newest_checkpoint(run_dir: Path) -> Path | None:
     """A run's newest checkpoint; None if it has none."""
-    return max(run_dir.glob(CHECKPOINT_PATTERN), key=_age, default=None)
+    return max(run_dir.glob(CHECKPOINT_PATTERN), key=_iteration_key, default=None)
 
 
-def _age(path: Path) -> tuple[int, str]:
+def _iteration_key(path: Path) -> tuple[int, str]:
     """Orders the checkpoints of one run by iteration."""
     return len(path.name), path.name
 
@@ -86,7 +86,7 @@ def check_run_dir(run_dir: Path, resumed: Path | None = None) -> None:
         raise ValueError(f"run directory {str(run_dir)!r} is a file")
     newest = newest_checkpoint(run_dir)
     own = resumed is not None and resumed.resolve().parent == run_dir.resolve()
-    if newest and not (own and resumed and _age(newest) <= _age(resumed)):
+    if newest and not (own and resumed and _iteration_key(newest) <= _iteration_key(resumed)):
         what = "has a newer checkpoint than that" if own else "already holds a run"
         raise ValueError(
             f"run directory {str(run_dir)!r} {what}; go on with --resume {newest}, or choose another --run-dir"
@@ -298,7 +298,7 @@ class DualRunner:
         others = self.ranks.gather(self._own_state)
         if self.ranks.leads:
             save_checkpoint(target, self._content() | {"others": others})
-            older = [path for path in checkpoints_of(self.run_dir) if _age(path) < _age(target)]
+            older = [path for path in checkpoints_of(self.run_dir) if _iteration_key(path) < _iteration_key(target)]
             if older:
                 _shed_simulator_states(older[-1])
         self._saved = self.current_learning_iteration
@@ -351,7 +351,7 @@ class DualRunner:
         env: Any = self.env
         saved = env.state_dict() if envs and self.runner_cfg.save_envs else {}
         # Exploration and mini-batches are drawn where the networks are.
-        drawn = {"device_rng": torch.cuda.get_rng_state(self.device)} if self._on_card else {}
+        drawn = {"device_rng": torch.cuda.get_rng_state(self.device)} if self._on_gpu else {}
         return {"env": saved, "rng": torch.get_rng_state(), **drawn}
 
     @property
@@ -363,11 +363,11 @@ class DualRunner:
         """Draw on as the run did that saved `mine`; what it did not save, or drew elsewhere, begins anew."""
         if "rng" in mine:
             torch.set_rng_state(mine["rng"].cpu())
-        if self._on_card and "device_rng" in mine:
+        if self._on_gpu and "device_rng" in mine:
             torch.cuda.set_rng_state(mine["device_rng"].cpu(), self.device)
 
     @property
-    def _on_card(self) -> bool:
+    def _on_gpu(self) -> bool:
         return torch.device(self.device).type == "cuda"
 
     def _content(self, envs: bool = True) -> dict[str, Any]:

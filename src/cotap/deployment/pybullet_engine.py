@@ -33,7 +33,7 @@ class PybulletEngine:
             raise ModuleNotFoundError(
                 "the engine pybullet is not installed; in cotap's folder, pip install -e '.[pybullet]'"
             ) from error
-        self._model, self._names = with_rotors(spec), pybullet
+        self._model, self._pybullet = with_rotors(spec), pybullet
         self._limit = cfg.torque_limit_scale * np.array([j.torque_limit_nm for j in spec.joints])
         self._bullet = bullet = BulletClient(pybullet.DIRECT)
         bullet.setGravity(0.0, 0.0, -GRAVITY_M_S2)
@@ -88,7 +88,7 @@ class PybulletEngine:
         if held:
             position, attitude = self._bullet.getBasePositionAndOrientation(self._robot)
             self._held = self._bullet.createConstraint(
-                self._robot, -1, -1, -1, self._names.JOINT_FIXED, [0.0] * 3, [0.0] * 3, position,
+                self._robot, -1, -1, -1, self._pybullet.JOINT_FIXED, [0.0] * 3, [0.0] * 3, position,
                 childFrameOrientation=attitude,
             )  # fmt: skip
             self._bullet.changeConstraint(self._held, maxForce=1e5)
@@ -99,7 +99,7 @@ class PybulletEngine:
         for _ in range(steps):
             torque = np.clip(law.torque(q, dq), -self._limit, self._limit)
             self._bullet.setJointMotorControlArray(
-                self._robot, self._joints, self._names.TORQUE_CONTROL, forces=torque.tolist()
+                self._robot, self._joints, self._pybullet.TORQUE_CONTROL, forces=torque.tolist()
             )
             for force in forces:
                 self._push(force)
@@ -122,9 +122,9 @@ class PybulletEngine:
 
     def _load(self) -> int:
         flags = (
-            self._names.URDF_USE_INERTIA_FROM_FILE
-            | self._names.URDF_USE_SELF_COLLISION
-            | self._names.URDF_USE_SELF_COLLISION_EXCLUDE_PARENT
+            self._pybullet.URDF_USE_INERTIA_FROM_FILE
+            | self._pybullet.URDF_USE_SELF_COLLISION
+            | self._pybullet.URDF_USE_SELF_COLLISION_EXCLUDE_PARENT
         )
         # The importer drops inertias that no rigid body could have, as a link with a rotor does: it gets spheres'.
         spheres = tuple(dataclasses.replace(b, diaginertia=(max(b.diaginertia),) * 3) for b in self._model.bodies)
@@ -154,7 +154,7 @@ class PybulletEngine:
         position, attitude = self._link_frame(force.body)
         point = position + attitude.apply(force.point)
         self._bullet.applyExternalForce(
-            self._robot, self._links[force.body], force.force_w.tolist(), point.tolist(), self._names.WORLD_FRAME
+            self._robot, self._links[force.body], force.force_w.tolist(), point.tolist(), self._pybullet.WORLD_FRAME
         )
 
     def _link_frame(self, body: str) -> tuple[np.ndarray, Rotation]:

@@ -77,7 +77,7 @@ class Robot:
         self._reader = StateReader(spec, self._source, torch.float64)
         self._rng = np.random.default_rng()
         self._queue: deque[JointLaw] = deque()
-        self._lost: Readings | None = None
+        self._last_reading: Readings | None = None
         self._truth: RobotState | None = None  # read once per control step
 
     def start(self, joints: np.ndarray, seed: int) -> None:
@@ -98,7 +98,7 @@ class Robot:
         self.engine.reset(qpos, qvel, mass_scale)
         self._truth = None
         self._queue = deque([self.holding(qpos[7:])] * (1 + delay))
-        self._lost = None
+        self._last_reading = None
 
     def holding(self, joints: np.ndarray) -> JointLaw:
         """PD control that holds `joints` (J,)."""
@@ -128,9 +128,9 @@ class Robot:
         noisy = self.cfg.encoder_noise > 0.0
         arms = self._reader.arm_chains.pose(self._reader.arm_joints(q)) if noisy else truth.arms
         readings = Readings(measured(truth, joint_pos=q, joint_vel=dq, arms=arms), self.torque())
-        if self._lost is not None and self._rng.random() < self.cfg.drop:
-            return self._lost
-        self._lost = readings
+        if self._last_reading is not None and self._rng.random() < self.cfg.drop:
+            return self._last_reading
+        self._last_reading = readings
         return readings
 
     def act(

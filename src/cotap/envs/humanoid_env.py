@@ -66,7 +66,7 @@ class HumanoidEnv(VecEnv):
     def __init__(self, cfg: HumanoidEnvConfig | None = None, processes: int = 1) -> None:
         self.cfg = cfg = cfg or HumanoidEnvConfig()
         cfg.check()
-        self._envs_in_all = cfg.num_envs * require_positive_int("processes", processes)
+        self._total_envs = cfg.num_envs * require_positive_int("processes", processes)
         self.num_envs = cfg.num_envs
         self.spec = spec = ROBOTS[cfg.robot]()
         modulated = cfg.upper_body.modulation.targets([arm.side for arm in spec.arms])
@@ -186,7 +186,7 @@ class HumanoidEnv(VecEnv):
         bad = diverged(self.sim.qpos, self.sim.qvel)
         self.state = self.reader.read()
         self.torque = self.actuation.joint_torque(self.state)
-        self.samples += self._envs_in_all
+        self.samples += self._total_envs
         self.episode_length_buf += 1
         self._advance()
         tilt = self.cfg.terminations.max_tilt_rad
@@ -197,7 +197,7 @@ class HumanoidEnv(VecEnv):
             (self.state.joint_vel - velocity_before) / self.dt, self.torque, self.actuation.current, fell,
             self.hand_force_w, self.forces.hand_push_w, self.upper_body.compliant,
         )  # fmt: skip
-        self.curriculum.step(fell, self._envs_in_all)
+        self.curriculum.step(fell, self._total_envs)
         self.num_diverged += int(bad.sum())
         rewards, log = self._reward(bad, time_out)
         self.observer.last_action = action

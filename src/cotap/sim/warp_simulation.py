@@ -30,7 +30,7 @@ class WarpSimulation(Simulation):
         model: Compiled model; copied.
         num_envs: Number of envs.
         substeps: Physics steps per control step.
-        device: Where they are: "cpu" (to develop and test), or "cuda" with or without a card's number.
+        device: Where they are: "cpu" (to develop and test), or "cuda" with or without the number of a GPU.
         fields: Names of `mjModel` fields that are to differ between envs.
 
     Raises:
@@ -111,7 +111,7 @@ class WarpSimulation(Simulation):
 
 
 def _warp_device(device: str) -> wp.Device:
-    """Warp's name for torch's `device`; "cuda" is torch's present card."""
+    """Warp's name for torch's `device`; "cuda" is torch's present GPU."""
     place = torch.device(device)
     index = torch.cuda.current_device() if place.type == "cuda" and place.index is None else place.index
     try:

@@ -46,8 +46,8 @@ class Pilot:
     ) -> None:  # fmt: skip
         c, s = yaw.cos().unsqueeze(1), yaw.sin().unsqueeze(1)
         x, y, turn = waypoints.to(position_w).unbind(2)
-        forward = torch.stack((c * x - s * y, s * x + c * y), 2)
-        self.waypoints_w = torch.cat((position_w.unsqueeze(1) + forward, (yaw.unsqueeze(1) + turn).unsqueeze(2)), 2)
+        offset_w = torch.stack((c * x - s * y, s * x + c * y), 2)
+        self.waypoints_w = torch.cat((position_w.unsqueeze(1) + offset_w, (yaw.unsqueeze(1) + turn).unsqueeze(2)), 2)
         """(N, W, 3) x, y [m] and yaw [rad] in the world."""
         self._segment_s, self._limits, self._speed_limit, self._segment = segment_s, limits, speed_limit, -1
         self._at_position = torch.zeros(len(waypoints), dtype=torch.bool, device=position_w.device)
