@@ -151,7 +151,8 @@ def test_arms_have_laws_of_their_own():
         2.0,
         (1.0, 2.0, 3.0),
     )
-    shared = LawOptions("cotap+facet-matched", damping_ratio=0.5, reference_share=0.3, error="task").configure().right
+    matched = "cotap+facet-matched:damping_ratio=0.5,reference_share=0.3"
+    shared = LawOptions(error="task", left="cotap", right=matched).configure().right
     assert (shared.damping_ratio, shared.reference_share, shared.error) == (0.5, 0.3, "task")
 
 

@@ -33,14 +33,8 @@ class LawOptions:
     """What stiffness acts on: joint, or task (the error of the hand)."""
     damping: str | None = None
     """Damping of the arm: pd or critical."""
-    virtual_mass: float | None = None
-    """Mass of the hand's model [kg] (facet, hmc)."""
-    damping_ratio: float | None = None
-    """Damping of the hand's model, as a share of critical (facet, hmc)."""
     sensing: str | None = None
     """Force on the hand: privileged or estimated, from arm torques (facet, dcc)."""
-    reference_share: float | None = None
-    """Share of the compliance that the moving reference provides (cotap+facet-matched)."""
     passive: bool = False
     """Hold back changes of stiffness that would give away more energy than a store has (cotap). By default as in
     the training."""
