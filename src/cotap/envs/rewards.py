@@ -228,8 +228,7 @@ class LowerRewards:
 
     @term(-1.0)
     def vertical_velocity(s: StepRecord) -> torch.Tensor:
-        """Squared vertical velocity of the torso, up to 5 m/s: one robot whose simulation diverges would outweigh all
-        others."""
+        """Squared vertical velocity of the torso, up to 5 m/s: one diverging simulation would outweigh all others."""
         return s.state.torso_linear_velocity_h[:, 2].clamp(-5.0, 5.0).square()
 
     @term(-0.3)
