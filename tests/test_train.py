@@ -118,7 +118,7 @@ BAD = [
     ([CONTROL_DT, 0], ["control_dt", "got 0.0"]),
     ([VELOCITY_X, "nan", 1], ["commands.velocity_x[0]", "nan"]),
     ([VELOCITY_X, 1, -1], ["commands.velocity_x", "(1.0, -1.0)"]),
-    ([REACH, "inf"], ["motions.reach", "inf"]),
+    ([REACH, "inf"], ["motions.generator.reach", "inf"]),
     ([EPISODE, "nan"], ["terminations.episode_s", "nan"]),
     ([REWARD, "nan"], ["rewards.lower.track_velocity", "nan"]),
     ([HISTORY, 0], ["observations.history", "got 0"]),
