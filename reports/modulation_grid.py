@@ -49,8 +49,6 @@ REFINED_BY = (4.0, 2.0)
 """Factors by which the stiffness along axes is changed, one after the other, around the best setting."""
 AXES = ((0,), (1,), (2,), (0, 1))
 """Axes whose stiffness is changed together: each of x, y and z, and the horizontal ones."""
-STANDARD = "h1-cotap"
-"""The policy whose legs carry constant settings."""
 STORE = {False: "no store", True: "store"}
 
 Setting = tuple[float, float, float, float]
@@ -63,8 +61,8 @@ class Options:
 
     checkpoint: str = ""
     """The policy that sets the laws; empty for none: best constant setting and oracle alone."""
-    constant_checkpoint: str = ""
-    """The policy whose legs carry the grid, the best setting and the oracle; empty for h1-cotap."""
+    constant_checkpoint: str = "h1-cotap"
+    """The policy whose legs carry the grid, the best setting and the oracle."""
     alphas: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 1.0)
     """Of the grid."""
     stiffnesses: tuple[float, ...] = (80.0, 160.0, 300.0, 600.0, 1200.0)
@@ -160,7 +158,7 @@ def measure(options: Options) -> dict[str, Any]:
     grid = _grid(options)
     best = _best(grid, "return")
     by_state = tuple(_best(grid, f"return_{part}") for part in PARTS)
-    start = options.constant_checkpoint or STANDARD
+    start = options.constant_checkpoint
     rows: list[dict[str, Any]] = []
     for passive in (False, True):
 
@@ -186,14 +184,13 @@ def measure(options: Options) -> dict[str, Any]:
 
 def _grid(options: Options) -> list[dict[str, Any]]:
     """Every setting of the grid, and those around its best, with what they got."""
-    path = options.constant_checkpoint or STANDARD
     rows: list[dict[str, Any]] = []
 
     def add(settings: list[Setting]) -> None:
         for setting in settings:
             print(f"  {_named(setting)}", file=sys.stderr)
             trial = Trial(num_envs=options.grid_envs, seed=options.seed, upper_actions="reference")
-            rows.append({"setting": setting, **_run(options, path, trial, setting)})
+            rows.append({"setting": setting, **_run(options, options.constant_checkpoint, trial, setting)})
 
     add(options.settings())
     for factor in REFINED_BY:

@@ -192,7 +192,6 @@ def test_parts_are_run_as_they_ask_and_otherwise_as_the_policy_was_trained(polic
         ((laws, engine, wrong, safety, Scenario(2.0)), 4, 7),
     ]
     assert result["engines"] == {"mujoco": {"a": {"ran": []}, "b": {"ran": []}}}
-    assert result["dt"] == policy.metadata.control_dt
 
 
 def a_result() -> dict[str, Any]:
@@ -208,7 +207,7 @@ def a_result() -> dict[str, Any]:
         "velocity-tracking": fell | {"metrics": {"e_lin": some}}, "periodic-load": {"time": [0.0, 0.02], "arms": arms},
         "perturbations": {"late": fell},
     }  # fmt: skip
-    return {"dt": 0.02, "settings": {"motion": "mixture"}, "engines": {"mujoco": one}}
+    return {"settings": {"motion": "mixture"}, "engines": {"mujoco": one}}
 
 
 def test_the_report_has_every_number_in_its_place():

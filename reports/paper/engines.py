@@ -117,7 +117,7 @@ def compare(path: Path, cfg: Comparison, jobs: int, parts: Path) -> dict[str, An
     policy = OnnxPolicy(path)
     about = to_plain(cfg) | {"checkpoint_sha256": policy.metadata.checkpoint_sha256}
     alone = {k: v for k, v in about.items() if k != "engines"}  # no engine's parts depend on which others there are
-    result: dict[str, Any] = {"settings": about, "dt": policy.metadata.control_dt, "engines": {}}
+    result: dict[str, Any] = {"settings": about, "engines": {}}
     with Workers(path, jobs) as workers:
         for name in cfg.engines:
             engine, done = cfg.engine(name), result["engines"].setdefault(name, {})

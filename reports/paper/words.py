@@ -47,15 +47,10 @@ def share(events: int, of_all: int) -> str:
 
 def hundredfold(m: dict[str, Any] | None, digits: int = 1) -> str:
     """A share in percent, or a length in centimetres, with its interval."""
-    return scaled(m, 100.0, digits)
-
-
-def scaled(m: dict[str, Any] | None, factor: float, digits: int = 1) -> str:
-    """A measure in a unit of which `factor` make one of its own, as mean and interval."""
     if m is None or m["mean"] is None:
         return number(m)
-    bounds = m["ci95"] and [factor * bound for bound in m["ci95"]]
-    return number(m | {"mean": factor * m["mean"], "ci95": bounds}, digits)
+    bounds = m["ci95"] and [100.0 * bound for bound in m["ci95"]]
+    return number(m | {"mean": 100.0 * m["mean"], "ci95": bounds}, digits)
 
 
 def fallen(result: dict[str, Any]) -> str:
