@@ -34,9 +34,9 @@ class DualPPOConfig:
     """Hidden layers of every actor and critic."""
     initial_std: float = 0.6
     """Standard deviation of actions at the start."""
-    std_half_life: float = 150e6
+    std_half_life: float = 30e6
     """Samples in which the standard deviation of actions halves; 0 to learn it instead."""
-    least_std: float = 0.12
+    least_std: float = 0.2
     """Lower bound of the standard deviation while it follows `std_half_life`."""
     steps: int = 24
     """Steps per env and iteration."""

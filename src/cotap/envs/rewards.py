@@ -182,14 +182,14 @@ class LowerRewards:
         """Velocity against its command, narrow kernel: the last tenth of a metre per second."""
         return torch.exp(-_velocity_error(s) / 0.04)
 
-    @term(10.0)
+    @term(6.0)
     def track_mean_velocity(s: StepRecord) -> torch.Tensor:
         """Velocity averaged over a stride, so that sway costs nothing: 1 at its command, 0 where forward and leftward
         errors add up to 0.5 m/s. Linear: an exponential kernel is flat at the slow walk that training begins with, and
         a norm is flat in the smaller of the two errors."""
         return _linear(s.mean_error[:, :2].abs().sum(1), 0.5)
 
-    @term(8.0)
+    @term(1.0)
     def track_yaw_rate(s: StepRecord) -> torch.Tensor:
         """Angular velocity about the vertical against its command, wide kernel."""
         return torch.exp(-(s.command.yaw_rate - s.state.yaw_rate).square())
@@ -237,7 +237,7 @@ class LowerRewards:
         simulation diverges would outweigh all others."""
         return s.state.torso_angular_velocity_t[:, :2].clamp(-20.0, 20.0).square().sum(1)
 
-    @term(5.0)
+    @term(7.0)
     def contact_schedule(s: StepRecord) -> torch.Tensor:
         """Share of feet that are on the ground, or off it, as the phase asks; worth less the further the velocity
         is off its command."""
